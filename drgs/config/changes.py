@@ -70,6 +70,7 @@ OPEN_AT_START = (
     "init.num_points",
     "densify.budget.gaussians",
     "densify.mcmc.gaussians",
+    "optimizer.scales_lr",
     "coarse",
 )
 """The same, with those that only a fit needs."""

@@ -285,7 +285,12 @@ class OptimizerConfig(Section):
     opacities_lr: Rate = Field(
         0.05, ge=0, description="Rate of the logit opacities (0.025 in newer references)."
     )
-    scales_lr: Rate = Field(2e-2, ge=0, description="Rate of the log scales.")
+    scales_lr: Resolved[Rate] = Field(
+        UNRESOLVED,
+        ge=0,
+        description="Rate of the log scales. null: 0.02 for objects that are cut out, 0.01 for "
+        "other photographs.",
+    )
     quats_lr: Rate = Field(2e-3, ge=0, description="Rate of the quaternions.")
     decay: Resolved[float] = Field(
         UNRESOLVED,

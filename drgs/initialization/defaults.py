@@ -26,6 +26,8 @@ GAUSSIANS_PER_PIXEL_OF_SIDE = 250  # that strategies grow to, in proportion to t
 SHARE_AT_START, REFERENCE_POINTS = 0.4, 100_000
 """Share of such a number that a fit starts with; and its number for other strategies."""
 
+SCALES_LR_CUT_OUT, SCALES_LR = 0.02, 0.01  # where edges are sharp; and for other photographs
+
 COARSE_SHARE = 0.35  # of a fit's iterations, with photographs at half size: see ``bench recipes``
 
 MIN_COARSE_SIDE_PX = 100  # of photographs that are made smaller still; SSIM's window has 11 px
@@ -62,8 +64,12 @@ def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
             "the cameras"
         )
     changes |= _numbers_of_gaussians(config, dataset)
-    if config.coarse is None:
-        changes["coarse"] = _coarse_stages(config, dataset)
+    if config.coarse is None or config.optimizer.scales_lr is None:
+        is_cut_out = _is_cut_out(dataset)
+        if config.coarse is None:
+            changes["coarse"] = [] if is_cut_out else _coarse_stages(config, dataset)
+        if config.optimizer.scales_lr is None:
+            changes["optimizer.scales_lr"] = SCALES_LR_CUT_OUT if is_cut_out else SCALES_LR
     return with_changes(config, changes) if changes else config
 
 
@@ -85,11 +91,11 @@ def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, obje
 
 
 def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
-    """Return coarse stages for photographs; none for cut-out objects, which start in place."""
+    """Return coarse stages for photographs; cut-out objects, which start in place, have none."""
     until = round(COARSE_SHARE * config.iterations)
     sides = [min(view.width, view.height) for view in dataset.train]
     is_small = min(sides, default=0) < MIN_COARSE_SIDE_PX
-    if config.densify.strategy == "adc" or until < 1 or is_small or _is_cut_out(dataset):
+    if config.densify.strategy == "adc" or until < 1 or is_small:
         return []
     return [{"until": until, "factor": 2}]
 

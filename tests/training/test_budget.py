@@ -55,7 +55,13 @@ def test_power_law_is_interpolated_and_extrapolated(n):
 
 SLOW = Curve((1000, 2000), (1000.0, 2000.0), (30.0, 31.0))
 FAST = Curve((1000, 2000), (500.0, 1000.0), (29.5, 30.5))
-CONFIG = FitConfig(data={"path": "."}, init={"num_points": 50}, iterations=7000, coarse=[])
+CONFIG = FitConfig(
+    data={"path": "."},
+    init={"num_points": 50},
+    iterations=7000,
+    optimizer={"scales_lr": 0.02},
+    coarse=[],
+)
 
 
 def curves_of(slow=SLOW, fast=FAST):

@@ -13,7 +13,7 @@ EXTENT = 2.5
 
 
 def rates_of(decay, decay_from=0.4):
-    optimizer = {"decay": decay, "decay_from": decay_from}
+    optimizer = {"decay": decay, "decay_from": decay_from, "scales_lr": 0.01}
     config = FitConfig(data={"path": "."}, iterations=50, optimizer=optimizer, coarse=[])
     return config.optimizer, rates_over_time(config, EXTENT)
 
