@@ -26,7 +26,8 @@ GAUSSIANS_PER_PIXEL_OF_SIDE = 250  # that strategies grow to, in proportion to t
 SHARE_AT_START, REFERENCE_POINTS = 0.4, 100_000
 """Share of such a number that a fit starts with; and its number for other strategies."""
 
-SCALES_LR_CUT_OUT, SCALES_LR = 0.02, 0.01  # where edges are sharp; and for other photographs
+SCALES_LR_CUT_OUT, SCALES_LR = 0.02, 0.01
+"""Rates of the log scales, for objects that are cut out and for other photographs."""
 
 COARSE_SHARE = 0.35  # of a fit's iterations, with photographs at half size: see ``bench recipes``
 
@@ -36,7 +37,7 @@ NUM_ALPHA_VIEWS = 15  # images, at most, by which a dataset is judged to be cut 
 
 
 def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
-    """Return ``config`` with background, near plane, numbers and coarse stages from ``dataset``.
+    """Return ``config`` with the values that follow from ``dataset``, such as its background.
 
     Given values stay. Raises :class:`UserError` for a near plane too close to what the cameras look
     at, and for steps of more views than there are.
@@ -64,12 +65,11 @@ def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
             "the cameras"
         )
     changes |= _numbers_of_gaussians(config, dataset)
-    if config.coarse is None or config.optimizer.scales_lr is None:
-        is_cut_out = _is_cut_out(dataset)
-        if config.coarse is None:
-            changes["coarse"] = [] if is_cut_out else _coarse_stages(config, dataset)
-        if config.optimizer.scales_lr is None:
-            changes["optimizer.scales_lr"] = SCALES_LR_CUT_OUT if is_cut_out else SCALES_LR
+    is_cut_out = _is_cut_out(dataset)
+    if config.coarse is None:
+        changes["coarse"] = [] if is_cut_out else _coarse_stages(config, dataset)
+    if config.optimizer.scales_lr is None:
+        changes["optimizer.scales_lr"] = SCALES_LR_CUT_OUT if is_cut_out else SCALES_LR
     return with_changes(config, changes) if changes else config
 
 
@@ -91,7 +91,7 @@ def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, obje
 
 
 def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
-    """Return coarse stages for photographs; cut-out objects, which start in place, have none."""
+    """Return coarse stages for photographs that are not cut out: cut-out objects start in place."""
     until = round(COARSE_SHARE * config.iterations)
     sides = [min(view.width, view.height) for view in dataset.train]
     is_small = min(sides, default=0) < MIN_COARSE_SIDE_PX

@@ -165,6 +165,7 @@ from charbonnier import Charbonnier, CharbonnierSection
 from halving import Halving, HalvingSection
 from vignetting import Vignetting, VignettingSection
 
+# The rates' decay follows from the strategy's name: here it is that of ``halving``.
 settings = ["densify.strategy=budget", "loss.type=photometric", "optimizer.decay=0.1"]
 config = load_config("fit.yml", settings)
 config = config.model_copy(update={"extensions": {

@@ -1,4 +1,4 @@
-"""Settings that depend on the dataset: coarse stages."""
+"""Settings that depend on the dataset: coarse stages, and the rate of the scales."""
 
 from dataclasses import replace
 
@@ -50,6 +50,21 @@ def stages(config, dataset):
 )
 def test_large_photographs_are_fitted_at_half_their_size_first(changes, dataset, expected):
     assert stages(with_changes(CONFIG, changes), dataset) == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "alpha_of", "expected"),
+    [
+        ({}, None, 0.01),
+        ({}, lambda index: 1, 0.01),
+        ({}, lambda index: LEFT_HALF, 0.02),
+        ({"coarse": []}, lambda index: LEFT_HALF, 0.02),
+        ({"optimizer.scales_lr": 0.03}, lambda index: LEFT_HALF, 0.03),
+    ],
+)
+def test_scales_of_what_is_cut_out_move_faster(changes, alpha_of, expected):
+    config = resolve_defaults(with_changes(CONFIG, changes), photographs(alpha_of=alpha_of))
+    assert config.optimizer.scales_lr == expected
 
 
 def test_stages_stay_open_until_the_dataset_is_known():
