@@ -65,11 +65,12 @@ def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
             "the cameras"
         )
     changes |= _numbers_of_gaussians(config, dataset)
-    is_cut_out = _is_cut_out(dataset)
-    if config.coarse is None:
-        changes["coarse"] = [] if is_cut_out else _coarse_stages(config, dataset)
-    if config.optimizer.scales_lr is None:
-        changes["optimizer.scales_lr"] = SCALES_LR_CUT_OUT if is_cut_out else SCALES_LR
+    if config.coarse is None or config.optimizer.scales_lr is None:
+        is_cut_out = _is_cut_out(dataset)  # reads images, which a parallel fit has on other ranks
+        if config.coarse is None:
+            changes["coarse"] = [] if is_cut_out else _coarse_stages(config, dataset)
+        if config.optimizer.scales_lr is None:
+            changes["optimizer.scales_lr"] = SCALES_LR_CUT_OUT if is_cut_out else SCALES_LR
     return with_changes(config, changes) if changes else config
 
 

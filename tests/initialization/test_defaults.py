@@ -8,6 +8,7 @@ from support.datasets import dataset_of, view_at
 
 from drgs.config.changes import with_changes, with_decisions, with_iterations
 from drgs.config.schema import FitConfig
+from drgs.datasets.images import without_images
 from drgs.initialization.defaults import resolve_defaults
 
 CONFIG = FitConfig(data={"path": "unused"}, iterations=1000)
@@ -65,6 +66,13 @@ def test_large_photographs_are_fitted_at_half_their_size_first(changes, dataset,
 def test_scales_of_what_is_cut_out_move_faster(changes, alpha_of, expected):
     config = resolve_defaults(with_changes(CONFIG, changes), photographs(alpha_of=alpha_of))
     assert config.optimizer.scales_lr == expected
+
+
+def test_known_settings_need_no_images():
+    dataset = photographs(alpha_of=lambda index: LEFT_HALF)
+    known = resolve_defaults(CONFIG, dataset)
+    on_another_rank = replace(dataset, train=tuple(map(without_images, dataset.train)))
+    assert resolve_defaults(known, on_another_rank) == known
 
 
 def test_stages_stay_open_until_the_dataset_is_known():
