@@ -21,7 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -37,18 +37,22 @@ from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.types import Float, UInt32
 from drgs.datasets import load_dataset
+from drgs.datasets.images import downscale
 from drgs.datasets.types import View, evenly_spaced
+from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import initial_gaussians
 from drgs.results.files import HISTORY
 from drgs.results.metrics import psnr
 from drgs.training.density.budget import GROWTH_SHARE, GrowthToNumber
+from drgs.training.density.strategy import DensityReport
 from drgs.training.losses import Loss, LossTerm, PhotometricLoss
 from drgs.training.optimizer import LeanAdam, Population
 from drgs.training.steps import Stage
 from drgs.training.trainer import Trainer
 from fits import SCENES as SCENES_FOLDER
 from fits import add_case_option, make_parser, write_curves
+from scipy.special import expit
 from typing_extensions import override
 
 if TYPE_CHECKING:
@@ -66,16 +70,15 @@ RECIPE: Values = {
     "optimizer.sh0_lr": 5e-3,
     "optimizer.shN_lr": 1e-3,
     "optimizer.opacities_lr": 0.05,
-    "optimizer.scales_lr": 2e-2,
     "optimizer.quats_lr": 2e-3,
     "optimizer.decay": 0.03,
     "optimizer.decay_from": 0.75,
-    "densify.start": ITERATIONS // 20,
-    "densify.stop": ITERATIONS * 3 // 4,
     "densify.every": 100,
     "densify.budget.prune_opacity": 0.05,
 }
-"""The recipe of the study; what is not given follows from the scene."""
+"""The recipe of the study; what is not given follows from the scene, as do the scales' rates."""
+
+SCALES_LR_CUT_OUT, SCALES_LR = 2e-2, 1e-2
 
 
 # ----------------------------------------------------------------------------------------------
@@ -96,8 +99,8 @@ class Scene:
 
 SHIPPED = Scene("shipped", "the shipped scene", "lego_mini.yml", 200)
 LEGO = Scene("lego", "the original Lego", "lego.yml", 200, "nerf_synthetic/lego")
-FOX = Scene("fox", "the fox", "fox.yml", 240, "fox")
-HEAD = Scene("head", "the robot head", "photos.yml", 240, "colmap_robothead")
+FOX = Scene("fox", "the fox", "fox.yml", 160, "fox")
+HEAD = Scene("head", "the robot head", "photos.yml", 160, "colmap_robothead")
 
 THREE, PHOTOGRAPHS, ALL = (SHIPPED, LEGO, FOX), (FOX, HEAD), (SHIPPED, LEGO, FOX, HEAD)
 
@@ -113,6 +116,10 @@ class Change:
     def values(self, config: FitConfig) -> Values:
         """Return other values, given a configuration without open ones."""
         return {}
+
+    def views(self, config: FitConfig, views: Sequence[View]) -> Sequence[View]:
+        """Return other training views."""
+        return views
 
     def attach(self, trainer: Trainer) -> None:
         """Change a trainer before its first iteration."""
@@ -167,6 +174,39 @@ def replace_strategy(trainer: Trainer, kind: type[GrowthToNumber]) -> None:
     assert isinstance(former, GrowthToNumber), "the study's fits have this one"
     trainer.density = kind(former.config, former.coarse)
     trainer.density.begin(trainer.population)
+
+
+@dataclass
+class RecoveryAwarePruning(Change):
+    """Opacities are halved at times; three changes later, the least opaque fifth is replaced.
+
+    From Improved-GS (Deng et al. 2025).
+    """
+
+    every: int = 5  # changes
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        every = self.every
+
+        class Pruning(GrowthToNumber):
+            @override
+            def refine(self, population: Population, iteration: int) -> DensityReport:
+                config, turn = self.config, iteration // self.config.every % every
+                if turn == 3 and iteration > every * config.every:
+                    fifth = expit(np.quantile(population.host("logit_opacities"), 0.2))
+                    budget = config.budget.model_copy(update={"prune_opacity": float(fifth)})
+                    self.config = config.model_copy(update={"budget": budget})
+                report = super().refine(population, iteration)
+                self.config = config
+                if turn == 0 and iteration + 3 * config.every <= config.stop:
+                    value = population.value("logit_opacities")
+                    opacities = 0.5 / (1 + dr.exp(-flat(value)))
+                    logits = dr.log(opacities / (1 - opacities))
+                    population.set_values("logit_opacities", like(value, logits))
+                return report
+
+        replace_strategy(trainer, Pruning)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -286,6 +326,55 @@ class DecayOfHarmonics(StepChange):
         return replace(new, value=new.value - rate * old.value)
 
 
+@dataclass(frozen=True)
+class HarmonicsInTurns(Change):
+    """Harmonics above degree 0 have derivatives, and move, in one of a few iterations."""
+
+    every: int
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        class Changed(LeanAdam):
+            def _update(self, key: str, rates: object) -> list[dr.ArrayBase]:
+                is_due = dr.grad_enabled(self.state[key][0])
+                return super()._update(key, rates) if is_due else []
+
+        trainer.optimizer.__class__ = Changed
+
+    @override
+    def before(self, trainer: Trainer, iteration: int) -> None:
+        value = trainer.optimizer.state["shN"][0]
+        (dr.enable_grad if iteration % self.every == 0 else dr.disable_grad)(value)
+
+
+@dataclass
+class MeanOfIterates(Change):
+    """The mean of the iterates of the last iterations, with rates that do not fall as far."""
+
+    share: float  # of the iterations
+    decay: float
+    sums: dict[str, Float] = field(default_factory=dict)
+
+    @override
+    def values(self, config: FitConfig) -> Values:
+        return {"optimizer.decay": self.decay}
+
+    @override
+    def after(self, trainer: Trainer, iteration: int) -> None:
+        last = trainer.config.iterations
+        if iteration <= (1 - self.share) * last:
+            return
+        for name in PARAMETER_NAMES:
+            value = flat(trainer.population.value(name))
+            self.sums[name] = self.sums[name] + value if name in self.sums else type(value)(value)
+        dr.eval(self.sums)
+        if iteration == last:
+            for name, total in self.sums.items():
+                value = trainer.population.value(name)
+                count = last - math.floor((1 - self.share) * last)
+                trainer.population.set_values(name, like(value, total / count))
+
+
 # ----------------------------------------------------------------------------------------------
 # Changes of what is rendered
 # ----------------------------------------------------------------------------------------------
@@ -372,6 +461,55 @@ class _Kept(Stage):
     @override
     def end(self) -> None:
         pass
+
+
+class EachHalf(Change):
+    """The upper and the lower half of each image are views of their own."""
+
+    @override
+    def views(self, config: FitConfig, views: Sequence[View]) -> Sequence[View]:
+        halves = []
+        for view in views:
+            middle = view.height // 2
+            for name, rows in (("upper", slice(0, middle)), ("lower", slice(middle, view.height))):
+                planes = {
+                    plane: np.ascontiguousarray(np.asarray(pixels)[rows])
+                    for plane in ("image", "alpha", "mask")
+                    if (pixels := getattr(view, plane)) is not None
+                }
+                height = len(planes["image"])
+                frame = {"height": height, "cy": view.cy - rows.start, "files": {}}
+                halves.append(replace(view, name=f"{view.name}_{name}", **frame, **planes))
+        return halves
+
+
+class ShiftedPixels(Change):
+    """Four images a view, made smaller from photographs of twice the size with shifted pixels.
+
+    They are views of the same camera, whose pixels are half a pixel apart.
+    """
+
+    @override
+    def views(self, config: FitConfig, views: Sequence[View]) -> Sequence[View]:
+        large = config.data.model_copy(update={"image_size": 2 * views[0].width})
+        shifted = []
+        for view, twice in zip(views, load_dataset(large).train, strict=True):
+            for x, y in np.ndindex(2, 2):
+                planes = {
+                    plane: downscale(_shifted(np.asarray(pixels, np.float32), x, y), view.width)
+                    for plane in ("image", "alpha")
+                    if (pixels := getattr(twice, plane)) is not None
+                }
+                size = view.width / twice.width  # of a large pixel, in pixels
+                camera = {"cx": view.cx - x * size, "cy": view.cy - y * size, "files": {}}
+                shifted.append(replace(view, name=f"{view.name}_{x}{y}", **camera, **planes))
+        return shifted
+
+
+def _shifted(pixels: np.ndarray, x: int, y: int) -> np.ndarray:
+    """Return pixels from x, y on; the last ones are repeated."""
+    rows, columns = (np.arange(n) + k for n, k in zip(pixels.shape, (y, x), strict=False))
+    return pixels[rows.clip(max=len(rows) - 1)][:, columns.clip(max=len(columns) - 1)]
 
 
 class ViewsApart(Change):
@@ -535,17 +673,23 @@ IDEAS = (
         scenes=ALL,
     ),
     Idea(
-        "scales have twice their former rate",
+        "scales of cut-out objects have twice their former rate",
         Given({"optimizer.scales_lr": 1e-2}),
         "halves adapt sooner",
         is_kept=True,
-        scenes=ALL,
+        scenes=(SHIPPED, LEGO),
     ),
     Idea(
         "the number grows in proportion to the time, not to its root",
         GrowthByPower(0.5),
         "less time, as good",
         is_kept=True,
+    ),
+    Idea(
+        "scales of photographs too",
+        Given({"optimizer.scales_lr": 2e-2}),
+        "harms the robot head",
+        scenes=PHOTOGRAPHS,
     ),
     Idea("... to the square of the time", GrowthByPower(2), "worse"),
     Idea("all of these values", Given(FORMER), "", is_kept=True, scenes=ALL),
@@ -558,6 +702,9 @@ IDEAS = (
     Idea("harmonics at half of the rate", Given({"optimizer.shN_lr": 5e-4}), "trains less"),
     Idea("opacities and scales in the loss", OtherTerms(), "no better"),
     Idea("low-pass of 0.2 px^2", Given({"model.low_pass": 0.2}), "worse"),
+    Idea("opacities halved at times, a fifth replaced", RecoveryAwarePruning(), "open"),
+    Idea("four images a view, with shifted pixels", ShiftedPixels(), "open", scenes=ALL),
+    Idea("the mean of the last tenth, of faster rates", MeanOfIterates(0.1, 0.1), "open"),
     # Fewer iterations.
     Idea("towards Gauss-Newton: v^0.65", OtherPower(0.15), "worse"),
     Idea("away from it: v^0.35", OtherPower(-0.15), "no better"),
@@ -566,10 +713,19 @@ IDEAS = (
     Idea("halves inherit second moments", InheritedMoments(), "much worse: new rows have to move"),
     Idea("beta_2 of 0.9997", Given({"optimizer.beta_2": 0.9997}), "no better"),
     Idea("opacities at twice the rate", Given({"optimizer.opacities_lr": 0.1}), "no better"),
-    Idea("means: five times the final rate", Given({"optimizer.means_lr_final": 1.6e-5}), "open"),
+    Idea(
+        "means: five times the final rate", Given({"optimizer.means_lr_final": 1.6e-5}), "no better"
+    ),
     Idea("a Huber loss of width 0.05", OtherLoss(HuberLoss(0.05)), "little, for a kernel more"),
     Idea("each view far from the last ones", ViewsApart(), "no better"),
     # Less work.
+    Idea(
+        "half an image each, 1.5 times the iterations",
+        EachHalf(),
+        "open",
+        iterations=ITERATIONS * 3 // 2,
+    ),
+    Idea("harmonics move in every second iteration", HarmonicsInTurns(2), "open"),
     Idea("every second image at half size, until 70 %", EverySecondAtHalfSize(), "worse"),
     Idea(
         "twice as many Gaussians, three quarters of the iterations",
@@ -578,14 +734,24 @@ IDEAS = (
         iterations=ITERATIONS * 3 // 4,
     ),
     Idea("splats end at an alpha of 3/255", Given({"model.alpha_cut": 3 / 255}), "worse"),
-    Idea("changes every 50 iterations", Given({"densify.every": 50}), "open"),
-    Idea("errors in every fifth view", Given({"densify.budget.error_every": 5}), "open"),
+    Idea("changes every 50 iterations", Given({"densify.every": 50}), "no better"),
+    Idea("errors in every fifth view", Given({"densify.budget.error_every": 5}), "no better"),
     # More exact.
     Idea("peaks along rays", Given({"model.projection": "exact"}), "no better"),
     Idea("order per pixel", Given({"model.order": "pixel"}), "no better, twice the time"),
     # Photographs.
-    Idea("a colour transform each", Given({"colors.lr": 0.02}), "open", scenes=PHOTOGRAPHS),
-    Idea("refined cameras", Given({"cameras.optimise": True}), "open", scenes=PHOTOGRAPHS),
+    Idea(
+        "a colour transform each",
+        Given({"colors.lr": 0.02}),
+        "worse: test views have none",
+        scenes=PHOTOGRAPHS,
+    ),
+    Idea(
+        "refined cameras",
+        Given({"cameras.optimise": True}),
+        "worse: the poses are good",
+        scenes=PHOTOGRAPHS,
+    ),
     Idea("random start", Given({"init.start": "random"}), "open", scenes=(HEAD,)),
 )
 
@@ -617,8 +783,16 @@ def fit_point(scene: Scene, idea: Idea, data: Path | None) -> Point:
     config = load_config(SCENES_FOLDER / scene.config, overrides)
     dataset = load_dataset(config.data)
     config = resolve_defaults(with_changes(config, RECIPE), dataset)
+    by_case = {
+        "optimizer.scales_lr": SCALES_LR if scene in PHOTOGRAPHS else SCALES_LR_CUT_OUT,
+        "densify.start": idea.iterations // 20,
+        "densify.stop": idea.iterations * 3 // 4,
+    }
+    config = with_changes(config, by_case)
     config = with_changes(config, idea.change.values(config))
-    trainer = Trainer(config, dataset, initial_gaussians(config, dataset))
+    gaussians = initial_gaussians(config, dataset)
+    dataset = replace(dataset, train=tuple(idea.change.views(config, dataset.train)))
+    trainer = Trainer(config, dataset, gaussians)
     idea.change.attach(trainer)
     start = time.process_time()
     for iteration in range(1, config.iterations + 1):
