@@ -846,11 +846,11 @@ def finished_point(scene: Scene, idea: Idea, data: Path | None, out: Path) -> Po
     return Point(**json.loads(path.read_text()))
 
 
-def table(points: Sequence[Point], ideas: Sequence[Idea]) -> str:
+def table(points: Sequence[Point]) -> str:
     """Format all fits, a row for each idea: what it gives, in test and training views, dB."""
     found = {(p.idea, p.scene): p for p in points}
     rows = []
-    for idea in ideas:
+    for idea in IDEAS:
         cells, ratios = [], []
         for scene in ALL:
             point = found.get((idea.name, scene.name))
@@ -861,8 +861,9 @@ def table(points: Sequence[Point], ideas: Sequence[Idea]) -> str:
                 cells.append(f"{point.psnr:.2f} / {point.train_psnr:.2f} dB, {point.seconds:.0f} s")
             else:
                 sign = -1 if idea.is_kept else 1  # of taking it out
-                gains = sign * (point.psnr - recipe.psnr), point.train_psnr - recipe.train_psnr
-                cells.append(f"{gains[0]:+.2f} / {sign * gains[1]:+.2f}")
+                test = sign * (point.psnr - recipe.psnr)
+                train = sign * (point.train_psnr - recipe.train_psnr)
+                cells.append(f"{test:+.2f} / {train:+.2f}")
                 ratios.append((point.seconds / recipe.seconds) ** sign)
         time_ratio = f"{float(np.mean(ratios)):.2f}" if ratios else ""
         kept = ("yes" if idea.is_kept else "no") if ratios else ""
@@ -912,7 +913,7 @@ def main() -> None:
     with ThreadPoolExecutor(args.threads or os.cpu_count()) as pool:
         points = list(pool.map(lambda case: finished_point(*case, args.data, args.out), cases))
     write_rows(args.out / "ideas.csv", Point, points)
-    print(f"\n{machine()}, one thread a fit\n\n{table(points, IDEAS)}")
+    print(f"\n{machine()}, one thread a fit\n\n{table(points)}")
 
 
 if __name__ == "__main__":
