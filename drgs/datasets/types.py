@@ -129,6 +129,7 @@ class View(Viewpoint):
     mask: Pixels | None = None  # (height, width) float32: 1 for valid pixels, else 0
     depth: Pixels | None = None  # (height, width) float32, scene units; 0 where not known
     files: Mapping[str, Path] = field(default_factory=dict)  # of image, mask, depth
+    finer_image: Pixels | None = None  # (2 height, 2 width, 4) float32: see images.shift_pixels
 
 
 ViewFilter = Callable[[str], bool]  # accepts names of views whose images are to be read

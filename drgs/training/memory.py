@@ -18,6 +18,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.constants import ALPHA_CUT, LOW_PASS, TRANSMITTANCE_STOP
 from drgs.core.errors import UserError
 from drgs.core.memory import available_memory, format_bytes, resident_memory
+from drgs.datasets.images import shift_pixels
 from drgs.datasets.types import Dataset, View, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
@@ -106,7 +107,7 @@ def estimate(
     return FitMemory(
         process=PROCESS_BYTES,
         photographs=round(sum(_photograph_bytes(view, scale) for view in views)),
-        targets=round(scale**2 * pixel_bytes * sum(view.width * view.height for view in train)),
+        targets=round(scale**2 * pixel_bytes * sum(_target_pixels(view) for view in train)),
         gaussians=round(of_gaussian * count / processes),
         splats=round(ENTRY_BYTES * entries * times + SLOT_BYTES * min(slots, BAND_SLOTS)),
         pixels=round(PIXEL_BYTES * pixels * times + MEASURED_BYTES * measured),
@@ -116,6 +117,11 @@ def estimate(
 def max_num_gaussians(config: FitConfig, start: int) -> int:
     """Return the most Gaussians of a fit that starts with ``start``."""
     return density_strategy(config).max_num_gaussians(start, config.iterations)
+
+
+def _target_pixels(view: View) -> int:
+    """Return the pixels of all targets that are made of a view."""
+    return len(shift_pixels(view)) * view.width * view.height
 
 
 def _photograph_bytes(view: View, scale: float) -> float:

@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import Array
 from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
-from drgs.datasets.images import smaller_view
+from drgs.datasets.images import shift_pixels, smaller_view
 from drgs.datasets.types import View
 from drgs.integrator.scene import make_sensors
 from drgs.integrator.types import SplatsPlugin
@@ -29,28 +30,34 @@ class Stage:
 
     until: float  # last iteration
     views: list[TrainingView]
+    shifted: list[list[TrainingView]]  # each view's, itself first: see shift_pixels
     pixel_bytes: int  # see bytes_per_pixel
     room: int  # bytes left for targets and uploads that stay on the device
-    kept: set[int] = field(default_factory=set)  # indices of their views
+    kept: set[TrainingView] = field(default_factory=set)  # their views
+
+    def view(self, index: int, iteration: int) -> TrainingView:
+        """Return the view of that index for an iteration: its shifted ones take turns by round."""
+        shifted = self.shifted[index]
+        return shifted[(iteration - 1) // len(self.views) % len(shifted)]
 
     def keep_or_free(self, view: TrainingView) -> None:
         """Keep targets and uploads of a rendered view while there is room, else free them.
 
         Recent views are no more likely to be drawn next than the first ones.
         """
-        if view.index in self.kept:
+        if view in self.kept:
             return
         size = view.width * view.height * self.pixel_bytes
         if size > self.room:
             view.free()
         else:
             self.room -= size
-            self.kept.add(view.index)
+            self.kept.add(view)
 
     def end(self) -> None:
         """Free kept targets and uploads: the stage is over."""
-        for index in self.kept:
-            self.views[index].free()
+        for view in self.kept:
+            view.free()
         self.kept.clear()
 
 
@@ -66,12 +73,14 @@ def make_stages(
     window = config.loss.window, config.loss.sigma
     stages = []
     for until, resized in [*sizes, (math.inf, views)]:
-        sensors = make_sensors(resized, calibrated=is_refined)
-        training_views = [
-            TrainingView(view, index, sensor, effects, window)
-            for index, (view, sensor) in enumerate(zip(resized, sensors, strict=True))
+        of_photographs = [(view,) if is_refined else shift_pixels(view) for view in resized]
+        sensors = iter(make_sensors(list(chain(*of_photographs)), calibrated=is_refined))
+        shifted = [
+            [TrainingView(view, index, next(sensors), effects, window) for view in of_photograph]
+            for index, of_photograph in enumerate(of_photographs)
         ]
-        stages.append(Stage(until, training_views, bytes_per_pixel(effects), room))
+        whole = [training_views[0] for training_views in shifted]
+        stages.append(Stage(until, whole, shifted, bytes_per_pixel(effects), room))
     return stages
 
 
@@ -123,7 +132,7 @@ def plan_step(
         stage=stage,
         begins_stage=any(first - views_per_step <= each.until < first for each in stages),
         views=tuple(
-            StepView(i, i - first, stage.views[view_of(i, *order)]) for i in iterations if i > 0
+            StepView(i, i - first, stage.view(view_of(i, *order), i)) for i in iterations if i > 0
         ),
         num_averaged=max(late_views, len(iterations)),
         is_update=late_views <= views_per_step or last % late_views == 0,

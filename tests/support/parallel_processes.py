@@ -117,7 +117,12 @@ def _blurred() -> Any:
     return replace(dataset, train=tuple(views))
 
 
-DATASETS = {"plain": fits.plain_dataset, "transparent": fits.true_dataset, "blurred": _blurred}
+DATASETS = {
+    "plain": fits.plain_dataset,
+    "transparent": fits.true_dataset,
+    "finer": fits.finer_dataset,
+    "blurred": _blurred,
+}
 
 
 def fitted(size: int, changes: Mapping[str, Any], data: str = "plain", **task: int) -> Any:

@@ -101,6 +101,16 @@ def transparent_dataset(background=WHITE) -> Dataset:
     return with_views(true_dataset(background), lambda v: replace(v, depth=None))
 
 
+def finer_dataset() -> Dataset:
+    """The photographs with alpha, and finer images of four equal pixels each."""
+
+    def finer(view: View) -> View:
+        pixels = np.dstack([view.image, view.alpha])
+        return replace(view, finer_image=pixels.repeat(2, axis=0).repeat(2, axis=1))
+
+    return with_views(transparent_dataset(), finer)
+
+
 def with_views(dataset: Dataset, change: Callable[[View], View]) -> Dataset:
     """Changes of the training views."""
     return replace(dataset, train=tuple(map(change, dataset.train)))
