@@ -212,37 +212,36 @@ def smaller_view(view: View, factor: int) -> View:
         alpha=smaller(view.alpha),
         mask=smaller(view.mask, downscale_mask),
         depth=smaller(view.depth, downscale_depth),
-        finer_image=None,
     )
 
 
 def shift_pixels(view: View) -> tuple[View, ...]:
-    """Return the view, and with a finer image three more, whose pixels are elsewhere in it.
+    """Return the view, and if its images have finer ones three more, whose pixels are elsewhere.
 
     These are half a pixel to the right, below, or both; what lies beyond the image repeats its
     edge. Trained on in turns, they show a fit all of the finer image, not its means alone.
     """
-    if view.finer_image is None:
+    both = {"image": view.image, "alpha": view.alpha}
+    planes = {name: plane for name, plane in both.items() if plane is not None}
+    finer = {name: p.finer for name, p in planes.items() if isinstance(p, LazyImage) and p.finer}
+    if len(finer) < len(planes) or view.mask is not None or view.depth is not None:
         return (view,)
-    return (view, *(_shift(view, view.finer_image, x, y) for x, y in ((1, 0), (0, 1), (1, 1))))
+    shifted = [view]
+    for x, y in ((1, 0), (0, 1), (1, 1)):
+        images = {name: _shift(planes[name].shape, f, x, y) for name, f in finer.items()}
+        shifted.append(replace(view, cx=view.cx - x / 2, cy=view.cy - y / 2, **images))
+    return tuple(shifted)
 
 
-def _shift(view: View, finer: Pixels, x: int, y: int) -> View:
-    """Return the view with pixels that are means of ``finer`` from its pixel x, y on."""
+def _shift(shape: tuple[int, ...], finer: Callable[[], np.ndarray], x: int, y: int) -> LazyImage:
+    """Return an image whose pixels are means of the finer image from its pixel x, y on."""
 
-    def mean(channels: slice | int) -> np.ndarray:
-        part = np.asarray(finer)[y:, x:, channels]
+    def mean() -> np.ndarray:
+        part = finer()[y:, x:]
         edges = [(0, y), (0, x), (0, 0)][: part.ndim]
-        return downscale(np.pad(part, edges, "edge"), view.width)
+        return downscale(np.pad(part, edges, "edge"), shape[1])
 
-    shape = (view.height, view.width)
-    return replace(
-        view,
-        cx=view.cx - x / 2,
-        cy=view.cy - y / 2,
-        image=LazyImage((*shape, 3), lambda: mean(slice(3)), 0),
-        alpha=LazyImage(shape, lambda: mean(3), 0),
-    )
+    return LazyImage(shape, mean, 0)
 
 
 # Keeping
@@ -254,43 +253,37 @@ def compact_photograph(
     """Return ``image`` and ``alpha`` of a :class:`View` in a form that takes little memory.
 
     That is the file's pixels, or floats where they take less; numbers of 16 bits where scaling is
-    by no whole factor, which takes long. pixels: of :func:`drgs.io.images.read_pixels`.
+    by no whole factor, which takes long. Pixels with alpha and twice the size are finer images;
+    those of photographs, which a lens has blurred, were measured to gain nothing. pixels: of
+    :func:`drgs.io.images.read_pixels`.
     """
     height, width, channels = pixels.shape
     new_width, new_height = downscaled_size(width, height, max_width)
 
+    def full_image() -> np.ndarray:
+        return composite(as_numbers(pixels), background)
+
+    def full_alpha() -> np.ndarray:
+        return as_numbers(pixels[:, :, 3])
+
     def image() -> np.ndarray:
-        return downscale(composite(as_numbers(pixels), background), max_width)
+        return downscale(full_image(), max_width)
 
     def alpha() -> np.ndarray:
-        return downscale(as_numbers(pixels[:, :, 3]), max_width)
+        return downscale(full_alpha(), max_width)
 
     if 4 * new_width * new_height * channels < pixels.nbytes:
         return image(), alpha() if channels == 4 else None
     if width % new_width or height % new_height:
         return _quantize(image()), _quantize(alpha()) if channels == 4 else None
     shape = (new_height, new_width)
-    lazy_alpha = LazyImage(shape, alpha, 0) if channels == 4 else None
-    return LazyImage((*shape, 3), image, pixels.nbytes), lazy_alpha
-
-
-def find_finer_image(
-    pixels: np.ndarray, background: tuple[float, float, float], width: int
-) -> LazyImage | None:
-    """Return ``finer_image`` of a :class:`View`, if pixels have alpha and are twice as many a side.
-
-    It takes no memory of its own: :func:`compact_photograph` keeps the pixels. Photographs without
-    alpha have none: a lens has blurred them, and shifts were measured to gain nothing.
-    """
-    height, full_width, channels = pixels.shape
-    if full_width != 2 * width or height % 2 or channels != 4:
-        return None
-
-    def compute() -> np.ndarray:
-        numbers = as_numbers(pixels)
-        return np.dstack([composite(numbers, background), numbers[:, :, 3]])
-
-    return LazyImage(pixels.shape, compute, 0)
+    if channels == 3:
+        return LazyImage((*shape, 3), image, pixels.nbytes), None
+    is_halved = (width, height) == (2 * new_width, 2 * new_height)
+    finer = (full_image, full_alpha) if is_halved else (None, None)
+    return LazyImage((*shape, 3), image, pixels.nbytes, finer[0]), LazyImage(
+        shape, alpha, 0, finer[1]
+    )
 
 
 def _quantize(numbers: np.ndarray) -> LazyImage:
@@ -350,7 +343,6 @@ def unread_image(shape: tuple[int, ...], name: object) -> LazyImage:
 
 def without_images(view: View) -> View:
     """Return the view as if another process had read its images."""
-    planes = ("image", "alpha", "mask", "depth", "finer_image")
-    there = {name: getattr(view, name) for name in planes}
+    there = {name: getattr(view, name) for name in ("image", "alpha", "mask", "depth")}
     unread = {name: unread_image(p.shape, view.name) for name, p in there.items() if p is not None}
     return replace(view, **unread)

@@ -27,7 +27,6 @@ from drgs.datasets.images import (
     downscale_depth,
     downscale_mask,
     downscaled_size,
-    find_finer_image,
     is_array,
     num_threads,
     placeholder_pixels,
@@ -165,7 +164,6 @@ def load_views(
         image, alpha, mask, depth = (
             _read_images(config, frame, pixels) if is_read else _unread_images(frame, pixels, size)
         )
-        is_whole = is_read and mask is None and depth is None
         return View(
             name,
             frame.values.transform_matrix,
@@ -178,9 +176,6 @@ def load_views(
             mask=mask,
             depth=depth,
             files=frame.files,
-            finer_image=(
-                find_finer_image(pixels, config.background_rgb, size[0]) if is_whole else None
-            ),
         )
 
     return map_on_threads(load, frames, names, threads=num_threads(files))

@@ -27,6 +27,7 @@ class LazyImage:
     shape: tuple[int, ...]  # (H, W) or (H, W, 3)
     compute: Callable[[], np.ndarray]  # returns float32
     nbytes: int  # kept in memory, beside another image's
+    finer: Callable[[], np.ndarray] | None = None  # one of twice the size; see shift_pixels
 
     dtype: ClassVar = np.dtype(np.float32)
 
@@ -129,7 +130,6 @@ class View(Viewpoint):
     mask: Pixels | None = None  # (height, width) float32: 1 for valid pixels, else 0
     depth: Pixels | None = None  # (height, width) float32, scene units; 0 where not known
     files: Mapping[str, Path] = field(default_factory=dict)  # of image, mask, depth
-    finer_image: Pixels | None = None  # (2 height, 2 width, 4) float32: see images.shift_pixels
 
 
 ViewFilter = Callable[[str], bool]  # accepts names of views whose images are to be read

@@ -10,11 +10,16 @@ from support import small_fits as fits
 from support.datasets import edit, load, view_at
 
 from drgs.datasets.images import shift_pixels, smaller_view, without_images
+from drgs.datasets.types import LazyImage
 from drgs.training.steps import bytes_per_pixel
 
 
-def with_finer(view, image):
-    return replace(view, finer_image=image.astype(np.float32))
+def with_finer(view, image, alpha):
+    def plane(finer):
+        finer = finer.astype(np.float32)
+        return LazyImage((view.height, view.width, *finer.shape[2:]), None, 0, lambda: finer)
+
+    return replace(view, image=plane(image), alpha=plane(alpha))
 
 
 def test_views_of_shifted_pixels_have_what_is_on_their_rays():
@@ -22,8 +27,8 @@ def test_views_of_shifted_pixels_have_what_is_on_their_rays():
     view = replace(view_at((4, 0, 0), (0, 0, 0), 12, 8), cx=5.3, cy=4.4)
     y, x = np.mgrid[:16, :24] / 2 + 0.25  # film coordinates of the view, px
     ones = np.ones_like(x)
-    finer = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, ones, 0.5 * ones], axis=2)
-    views = shift_pixels(with_finer(view, finer))
+    finer = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, ones], axis=2)
+    views = shift_pixels(with_finer(view, finer, ones / 2))
     assert views[0].K.tolist() == view.K.tolist() and len(views) == 4
     for shifted in views[1:]:
         column, row = np.meshgrid(np.arange(12) + 0.5, np.arange(8) + 0.5)
@@ -37,7 +42,7 @@ def test_views_of_shifted_pixels_have_what_is_on_their_rays():
 def test_pixels_beyond_the_edge_repeat_it():
     view = view_at((4, 0, 0), (0, 0, 0), 2, 1)
     plane = np.array([[1.0, 2, 3, 4], [5, 6, 7, 8]])
-    right, below, both = shift_pixels(with_finer(view, np.stack([plane] * 4, axis=2)))[1:]
+    right, below, both = shift_pixels(with_finer(view, np.stack([plane] * 3, axis=2), plane))[1:]
     expected = {"right": [[4.5, 6]], "below": [[5.5, 7.5]], "both": [[6.5, 8]]}
     for name, shifted in (("right", right), ("below", below), ("both", both)):
         np.testing.assert_array_equal(shifted.alpha, expected[name])
@@ -48,25 +53,20 @@ def test_files_of_twice_the_size_with_alpha_are_finer_images(blender, photograph
     folder, images = blender
     view = load(folder, image_size=3, background=(0.2, 0.4, 0.6)).train[1]
     numbers = images["train", 1] / 255
-    alpha = numbers[..., 3:]
-    expected = numbers[..., :3] * alpha + np.array([0.2, 0.4, 0.6]) * (1 - alpha)
-    np.testing.assert_allclose(view.finer_image[..., :3], expected, atol=1e-6)
-    np.testing.assert_allclose(view.finer_image[..., 3:], alpha, atol=1e-6)
-    assert view.finer_image.nbytes == 0
-    np.testing.assert_allclose(view.image, smaller_of(view), atol=1e-6)
-    for size in (None, 2, 4):
-        assert load(folder, image_size=size).train[1].finer_image is None
-    assert load(photographs, image_size=4).train[0].finer_image is None  # without alpha
-    assert smaller_view(view, 3).finer_image is None
-    unread = without_images(view).finer_image
-    assert unread.shape == (4, 6, 4)
-    with pytest.raises(Exception, match="another process"):
-        np.asarray(unread)
-
-
-def smaller_of(view):
-    """Means of 2 x 2 pixels from the first one on."""
-    return np.asarray(view.finer_image)[..., :3].reshape(2, 2, 3, 2, 3).mean(axis=(1, 3))
+    alpha = numbers[..., 3]
+    expected = [
+        numbers[..., c] * alpha + color * (1 - alpha) for c, color in enumerate((0.2, 0.4, 0.6))
+    ]
+    np.testing.assert_allclose(view.image.finer(), np.stack(expected, axis=2), atol=1e-6)
+    np.testing.assert_allclose(view.alpha.finer(), alpha, atol=1e-6)
+    means = np.reshape(view.image.finer(), (2, 2, 3, 2, 3)).mean(axis=(1, 3))
+    np.testing.assert_allclose(view.image, means, atol=1e-6)
+    assert len(shift_pixels(view)) == 4
+    views = [load(folder, image_size=size).train[1] for size in (None, 2, 4)]
+    views += [load(photographs, image_size=4).train[0]]  # without alpha
+    views += [smaller_view(view, 3), without_images(view)]
+    views += [replace(view, image=np.asarray(view.image)), replace(view, alpha=means[..., 0])]
+    assert [len(shift_pixels(each)) for each in views] == [1] * 8
 
 
 @pytest.mark.parametrize("plane", ["mask", "depth"])
@@ -78,14 +78,14 @@ def test_views_with_masks_or_depths_are_not_shifted(blender, plane):
     first = {names[plane]: "plane.png"}
     edit(folder / "transforms_train.json", lambda meta: meta["frames"][0].update(first))
     first, second, _ = load(folder, image_size=3).train
-    assert first.finer_image is None and second.finer_image is not None
+    assert (len(shift_pixels(first)), len(shift_pixels(second))) == (1, 4)
 
 
 def test_fit_takes_turns_with_the_shifted_pixels_by_round():
     """Four rounds of six views, of which one has no finer image; coarse stages use none."""
     dataset = fits.finer_dataset()
     first, *others = dataset.train
-    dataset = replace(dataset, train=(replace(first, finer_image=None), *others))
+    dataset = replace(dataset, train=(replace(first, image=np.asarray(first.image)), *others))
     trainer, seen = fits.make_trainer(dataset, coarse=[{"until": 2, "factor": 2}]), {}
     for iteration in range(1, 25):
         trainer.iteration = iteration

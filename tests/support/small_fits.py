@@ -12,7 +12,7 @@ import numpy as np
 
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
-from drgs.datasets.types import Dataset, View
+from drgs.datasets.types import Dataset, LazyImage, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import render_views
 from drgs.reference import splatting as reference
@@ -104,11 +104,12 @@ def transparent_dataset(background=WHITE) -> Dataset:
 def finer_dataset() -> Dataset:
     """The photographs with alpha, and finer images of four equal pixels each."""
 
-    def finer(view: View) -> View:
-        pixels = np.dstack([view.image, view.alpha])
-        return replace(view, finer_image=pixels.repeat(2, axis=0).repeat(2, axis=1))
+    def finer(plane: np.ndarray) -> LazyImage:
+        large = plane.repeat(2, axis=0).repeat(2, axis=1)
+        return LazyImage(plane.shape, lambda: plane, plane.nbytes, lambda: large)
 
-    return with_views(transparent_dataset(), finer)
+    dataset = transparent_dataset()
+    return with_views(dataset, lambda v: replace(v, image=finer(v.image), alpha=finer(v.alpha)))
 
 
 def with_views(dataset: Dataset, change: Callable[[View], View]) -> Dataset:
