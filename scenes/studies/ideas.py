@@ -37,7 +37,6 @@ from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.types import Float, UInt32
 from drgs.datasets import load_dataset
-from drgs.datasets.images import downscale
 from drgs.datasets.types import View, evenly_spaced
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.initialization.defaults import resolve_defaults
