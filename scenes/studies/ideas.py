@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Values = Mapping[str, object]
+Correction = Callable[[np.ndarray], np.ndarray]
 """Values of a configuration, by names such as ``densify.every``."""
 
 ITERATIONS, NUM_TRAINING_VIEWS = 2000, 15
@@ -128,6 +129,10 @@ class Change:
 
     def after(self, trainer: Trainer, iteration: int) -> None:
         """Called after each iteration."""
+
+    def correction(self, trainer: Trainer, views: Sequence[View]) -> Correction:
+        """Return what a rendered image (H, W, 3) becomes before it is compared; views: trained."""
+        return lambda image: image
 
 
 @dataclass(frozen=True)
@@ -490,6 +495,39 @@ class PixelsAsTheyAre(Change):
         return [replace(view, image=np.asarray(view.image)) for view in views]
 
 
+class VignettingAndResponse(Change):
+    """A camera's vignetting and response: the curves of each channel change with the radius.
+
+    They are found after the fit, by least squares over the training views: polynomials of degree 4
+    in the value, times those of degree 3 in the squared distance from the centre.
+    """
+
+    @override
+    def correction(self, trainer: Trainer, views: Sequence[View]) -> Correction:
+        images = list(trainer.images(views))
+        photographs = np.concatenate([np.asarray(v.image).reshape(-1, 3) for v in views])
+        coefficients = []
+        for channel in range(3):
+            terms = np.concatenate([self._terms(image[..., channel]) for image in images])
+            coefficients.append(np.linalg.lstsq(terms, photographs[:, channel], rcond=None)[0])
+
+        def corrected(image: np.ndarray) -> np.ndarray:
+            values = [self._terms(image[..., c]) @ coefficients[c] for c in range(3)]
+            return np.stack(values, axis=1).reshape(image.shape).clip(0, 1)
+
+        return corrected
+
+    @staticmethod
+    def _terms(values: np.ndarray) -> np.ndarray:
+        """Return (pixels, 20) terms of the values (H, W) and their places."""
+        height, width = values.shape
+        y, x = np.mgrid[:height, :width] + 0.5
+        squared = (x - width / 2) ** 2 + (y - height / 2) ** 2
+        radius = 4 * squared.ravel() / (width**2 + height**2)  # 1 in the corners
+        both = np.vander(values.ravel(), 5)[:, :, None] * np.vander(radius, 4)[:, None]
+        return both.reshape(len(radius), -1)
+
+
 class ViewsApart(Change):
     """Each view is one that few of the last ones are close to."""
 
@@ -745,6 +783,12 @@ IDEAS = (
         "worse: the poses are good",
         scenes=PHOTOGRAPHS,
     ),
+    Idea(
+        "vignetting and a response curve, found after the fit",
+        VignettingAndResponse(),
+        "",
+        scenes=PHOTOGRAPHS,
+    ),
     Idea("random start", Given({"init.start": "random"}), "much worse", scenes=(HEAD,)),
 )
 
@@ -795,20 +839,22 @@ def fit_point(scene: Scene, idea: Idea, data: Path | None) -> Point:
     trainer.check()  # waits for the device
     seconds = time.process_time() - start
     trainer.sync_scene()
+    correct = idea.change.correction(trainer, dataset.train)
+    some = evenly_spaced(dataset.train, NUM_TRAINING_VIEWS)
     return Point(
         scene=scene.name,
         idea=idea.name,
-        psnr=mean_psnr(trainer, dataset.test),
-        train_psnr=mean_psnr(trainer, evenly_spaced(dataset.train, NUM_TRAINING_VIEWS)),
+        psnr=mean_psnr(trainer, dataset.test, correct),
+        train_psnr=mean_psnr(trainer, some, correct),
         seconds=seconds,
         gaussians=trainer.num_gaussians,
     )
 
 
-def mean_psnr(trainer: Trainer, views: tuple[View, ...]) -> float:
+def mean_psnr(trainer: Trainer, views: tuple[View, ...], correct: Correction) -> float:
     """Return the mean PSNR of rendered views, dB."""
     pairs = zip(trainer.images(views), views, strict=True)
-    return float(np.mean([psnr(image, view.image, view.mask) for image, view in pairs]))
+    return float(np.mean([psnr(correct(image), view.image, view.mask) for image, view in pairs]))
 
 
 def finished_point(scene: Scene, idea: Idea, data: Path | None, out: Path) -> Point:
