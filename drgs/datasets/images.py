@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -216,32 +217,24 @@ def smaller_view(view: View, factor: int) -> View:
 
 
 def shift_pixels(view: View) -> tuple[View, ...]:
-    """Return the view, and if its images have finer ones three more, whose pixels are elsewhere.
+    """Return the view, and if its images can be shifted three more, whose pixels are elsewhere.
 
-    These are half a pixel to the right, below, or both; what lies beyond the image repeats its
-    edge. Trained on in turns, they show a fit all of the finer image, not its means alone.
+    These are half a pixel to the right, below, or both. Trained on in turns, they show a fit all
+    pixels of the file, not means of the same four alone.
     """
     both = {"image": view.image, "alpha": view.alpha}
     planes = {name: plane for name, plane in both.items() if plane is not None}
-    finer = {name: p.finer for name, p in planes.items() if isinstance(p, LazyImage) and p.finer}
-    if len(finer) < len(planes) or view.mask is not None or view.depth is not None:
+    shifted = {n: p.shifted for n, p in planes.items() if isinstance(p, LazyImage) and p.shifted}
+    if len(shifted) < len(planes) or view.mask is not None or view.depth is not None:
         return (view,)
-    shifted = [view]
+    views = [view]
     for x, y in ((1, 0), (0, 1), (1, 1)):
-        images = {name: _shift(planes[name].shape, f, x, y) for name, f in finer.items()}
-        shifted.append(replace(view, cx=view.cx - x / 2, cy=view.cy - y / 2, **images))
-    return tuple(shifted)
-
-
-def _shift(shape: tuple[int, ...], finer: Callable[[], np.ndarray], x: int, y: int) -> LazyImage:
-    """Return an image whose pixels are means of the finer image from its pixel x, y on."""
-
-    def mean() -> np.ndarray:
-        part = finer()[y:, x:]
-        edges = [(0, y), (0, x), (0, 0)][: part.ndim]
-        return downscale(np.pad(part, edges, "edge"), shape[1])
-
-    return LazyImage(shape, mean, 0)
+        images = {
+            name: LazyImage(planes[name].shape, partial(compute, x, y), 0)
+            for name, compute in shifted.items()
+        }
+        views.append(replace(view, cx=view.cx - x / 2, cy=view.cy - y / 2, **images))
+    return tuple(views)
 
 
 # Keeping
@@ -253,24 +246,18 @@ def compact_photograph(
     """Return ``image`` and ``alpha`` of a :class:`View` in a form that takes little memory.
 
     That is the file's pixels, or floats where they take less; numbers of 16 bits where scaling is
-    by no whole factor, which takes long. Pixels with alpha and twice the size are finer images;
-    those of photographs, which a lens has blurred, were measured to gain nothing. pixels: of
+    by no whole factor, which takes long. Pixels with alpha that are halved can be shifted; those of
+    photographs, which a lens has blurred, were measured to gain nothing. pixels: of
     :func:`drgs.io.images.read_pixels`.
     """
     height, width, channels = pixels.shape
     new_width, new_height = downscaled_size(width, height, max_width)
 
-    def full_image() -> np.ndarray:
-        return composite(as_numbers(pixels), background)
+    def image(x: int = 0, y: int = 0) -> np.ndarray:
+        return downscale(composite(as_numbers(_shift(pixels, x, y)), background), max_width)
 
-    def full_alpha() -> np.ndarray:
-        return as_numbers(pixels[:, :, 3])
-
-    def image() -> np.ndarray:
-        return downscale(full_image(), max_width)
-
-    def alpha() -> np.ndarray:
-        return downscale(full_alpha(), max_width)
+    def alpha(x: int = 0, y: int = 0) -> np.ndarray:
+        return downscale(as_numbers(_shift(pixels, x, y)[:, :, 3]), max_width)
 
     if 4 * new_width * new_height * channels < pixels.nbytes:
         return image(), alpha() if channels == 4 else None
@@ -280,10 +267,16 @@ def compact_photograph(
     if channels == 3:
         return LazyImage((*shape, 3), image, pixels.nbytes), None
     is_halved = (width, height) == (2 * new_width, 2 * new_height)
-    finer = (full_image, full_alpha) if is_halved else (None, None)
-    return LazyImage((*shape, 3), image, pixels.nbytes, finer[0]), LazyImage(
-        shape, alpha, 0, finer[1]
+    shifted = (image, alpha) if is_halved else (None, None)
+    return (
+        LazyImage((*shape, 3), image, pixels.nbytes, shifted[0]),
+        LazyImage(shape, alpha, 0, shifted[1]),
     )
+
+
+def _shift(pixels: np.ndarray, x: int, y: int) -> np.ndarray:
+    """Return as many pixels, from x, y on; beyond the image, its edge is repeated."""
+    return np.pad(pixels[y:, x:], ((0, y), (0, x), (0, 0)), "edge") if x or y else pixels
 
 
 def _quantize(numbers: np.ndarray) -> LazyImage:

@@ -27,7 +27,7 @@ class LazyImage:
     shape: tuple[int, ...]  # (H, W) or (H, W, 3)
     compute: Callable[[], np.ndarray]  # returns float32
     nbytes: int  # kept in memory, beside another image's
-    finer: Callable[[], np.ndarray] | None = None  # one of twice the size; see shift_pixels
+    shifted: Callable[[int, int], np.ndarray] | None = None  # by x, y of the file's; shift_pixels
 
     dtype: ClassVar = np.dtype(np.float32)
 

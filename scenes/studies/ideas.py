@@ -488,7 +488,7 @@ class EachHalf(Change):
 
 
 class PixelsAsTheyAre(Change):
-    """Images without finer ones, so that pixels are not shifted."""
+    """Images that cannot be shifted."""
 
     @override
     def views(self, config: FitConfig, views: Sequence[View]) -> Sequence[View]:

@@ -1,4 +1,4 @@
-"""Images of twice the size are averaged in four ways, and a fit takes turns with them."""
+"""Files of twice the size are halved in four ways, and a fit takes turns with them."""
 
 from dataclasses import replace
 
@@ -9,63 +9,61 @@ import pytest
 from support import small_fits as fits
 from support.datasets import edit, load, view_at
 
-from drgs.datasets.images import shift_pixels, smaller_view, without_images
-from drgs.datasets.types import LazyImage
+from drgs.datasets.images import (
+    compact_photograph,
+    shift_pixels,
+    smaller_view,
+    without_images,
+)
+from drgs.io.images import to_uint8
 from drgs.training.steps import bytes_per_pixel
 
 
-def with_finer(view, image, alpha):
-    def plane(finer):
-        finer = finer.astype(np.float32)
-        return LazyImage((view.height, view.width, *finer.shape[2:]), None, 0, lambda: finer)
-
-    return replace(view, image=plane(image), alpha=plane(alpha))
+def halved(view, pixels):
+    image, alpha = compact_photograph(to_uint8(pixels), (0.0, 0.0, 0.0), view.width)
+    return replace(view, image=image, alpha=alpha)
 
 
 def test_views_of_shifted_pixels_have_what_is_on_their_rays():
-    """A finer image of where its rays go: its means are where the rays of the new pixels go."""
+    """An image of where on the film its pixels are: shifted ones look there through theirs."""
     view = replace(view_at((4, 0, 0), (0, 0, 0), 12, 8), cx=5.3, cy=4.4)
-    y, x = np.mgrid[:16, :24] / 2 + 0.25  # film coordinates of the view, px
+    y, x = np.mgrid[:16, :24] / 2 + 0.25  # px of the view
     ones = np.ones_like(x)
-    finer = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, ones], axis=2)
-    views = shift_pixels(with_finer(view, finer, ones / 2))
+    views = shift_pixels(halved(view, np.stack([x / 12, y / 8, ones, ones], axis=2)))
     assert views[0].K.tolist() == view.K.tolist() and len(views) == 4
     for shifted in views[1:]:
         column, row = np.meshgrid(np.arange(12) + 0.5, np.arange(8) + 0.5)
-        rays = (column - shifted.cx) / shifted.fx, (row - shifted.cy) / shifted.fy
-        image = np.asarray(shifted.image)
-        for channel, expected in enumerate(rays):
-            np.testing.assert_allclose(image[:-1, :-1, channel], expected[:-1, :-1], atol=1e-6)
-        np.testing.assert_array_equal(shifted.alpha, np.full((8, 12), 0.5))
+        x = (column - shifted.cx) / shifted.fx * view.fx + view.cx
+        y = (row - shifted.cy) / shifted.fy * view.fy + view.cy
+        for found, expected in ((shifted.image[..., 0], x / 12), (shifted.image[..., 1], y / 8)):
+            np.testing.assert_allclose(found[:-1, :-1], expected[:-1, :-1], atol=0.6 / 255)
 
 
 def test_pixels_beyond_the_edge_repeat_it():
     view = view_at((4, 0, 0), (0, 0, 0), 2, 1)
-    plane = np.array([[1.0, 2, 3, 4], [5, 6, 7, 8]])
-    right, below, both = shift_pixels(with_finer(view, np.stack([plane] * 3, axis=2), plane))[1:]
-    expected = {"right": [[4.5, 6]], "below": [[5.5, 7.5]], "both": [[6.5, 8]]}
+    plane = np.array([[1.0, 2, 3, 4], [5, 6, 7, 8]]) / 255
+    right, below, both = shift_pixels(halved(view, np.stack([plane] * 4, axis=2)))[1:]
+    expected = {"right": [4.5, 6], "below": [5.5, 7.5], "both": [6.5, 8]}
     for name, shifted in (("right", right), ("below", below), ("both", both)):
-        np.testing.assert_array_equal(shifted.alpha, expected[name])
-        np.testing.assert_array_equal(shifted.image[..., 1], expected[name])
+        np.testing.assert_allclose(255 * np.asarray(shifted.alpha), [expected[name]], rtol=1e-6)
 
 
-def test_files_of_twice_the_size_with_alpha_are_finer_images(blender, photographs):
+def test_only_files_of_twice_the_size_with_alpha_are_shifted(blender, photographs):
     folder, images = blender
     view = load(folder, image_size=3, background=(0.2, 0.4, 0.6)).train[1]
     numbers = images["train", 1] / 255
     alpha = numbers[..., 3]
-    expected = [
-        numbers[..., c] * alpha + color * (1 - alpha) for c, color in enumerate((0.2, 0.4, 0.6))
-    ]
-    np.testing.assert_allclose(view.image.finer(), np.stack(expected, axis=2), atol=1e-6)
-    np.testing.assert_allclose(view.alpha.finer(), alpha, atol=1e-6)
-    means = np.reshape(view.image.finer(), (2, 2, 3, 2, 3)).mean(axis=(1, 3))
-    np.testing.assert_allclose(view.image, means, atol=1e-6)
-    assert len(shift_pixels(view)) == 4
+    colors = [numbers[..., c] * alpha + v * (1 - alpha) for c, v in enumerate((0.2, 0.4, 0.6))]
+    whole = np.stack([*colors, alpha], axis=2)
+    for found, (x, y) in zip(shift_pixels(view), ((0, 0), (1, 0), (0, 1), (1, 1)), strict=True):
+        expected = whole[y : y + 2, x : x + 4].reshape(1, 2, 2, 2, 4).mean(axis=(1, 3))
+        actual = np.dstack([found.image, found.alpha])
+        np.testing.assert_allclose(actual[:1, :2], expected, atol=1e-6)
     views = [load(folder, image_size=size).train[1] for size in (None, 2, 4)]
     views += [load(photographs, image_size=4).train[0]]  # without alpha
     views += [smaller_view(view, 3), without_images(view)]
-    views += [replace(view, image=np.asarray(view.image)), replace(view, alpha=means[..., 0])]
+    image = np.asarray(view.image)
+    views += [replace(view, image=image), replace(view, alpha=image[..., 0])]
     assert [len(shift_pixels(each)) for each in views] == [1] * 8
 
 
@@ -82,8 +80,8 @@ def test_views_with_masks_or_depths_are_not_shifted(blender, plane):
 
 
 def test_fit_takes_turns_with_the_shifted_pixels_by_round():
-    """Four rounds of six views, of which one has no finer image; coarse stages use none."""
-    dataset = fits.finer_dataset()
+    """Four rounds of six views, of which one cannot be shifted; nor can coarse stages'."""
+    dataset = fits.shifted_dataset()
     first, *others = dataset.train
     dataset = replace(dataset, train=(replace(first, image=np.asarray(first.image)), *others))
     trainer, seen = fits.make_trainer(dataset, coarse=[{"until": 2, "factor": 2}]), {}

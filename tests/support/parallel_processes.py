@@ -120,7 +120,7 @@ def _blurred() -> Any:
 DATASETS = {
     "plain": fits.plain_dataset,
     "transparent": fits.true_dataset,
-    "finer": fits.finer_dataset,
+    "shifted": fits.shifted_dataset,
     "blurred": _blurred,
 }
 

@@ -12,9 +12,11 @@ import numpy as np
 
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
-from drgs.datasets.types import Dataset, LazyImage, View
+from drgs.datasets.images import compact_photograph
+from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import render_views
+from drgs.io.images import to_uint8
 from drgs.reference import splatting as reference
 from drgs.results.metrics import ssim
 from drgs.training.effects.base import TrainingEffect
@@ -101,15 +103,16 @@ def transparent_dataset(background=WHITE) -> Dataset:
     return with_views(true_dataset(background), lambda v: replace(v, depth=None))
 
 
-def finer_dataset() -> Dataset:
-    """The photographs with alpha, and finer images of four equal pixels each."""
+def shifted_dataset() -> Dataset:
+    """The photographs with alpha, from files of twice the size: four equal pixels each."""
 
-    def finer(plane: np.ndarray) -> LazyImage:
-        large = plane.repeat(2, axis=0).repeat(2, axis=1)
-        return LazyImage(plane.shape, lambda: plane, plane.nbytes, lambda: large)
+    def halved(view: View) -> View:
+        pixels = to_uint8(np.dstack([view.image, view.alpha]))
+        large = pixels.repeat(2, axis=0).repeat(2, axis=1)
+        image, alpha = compact_photograph(large, (0.0, 0.0, 0.0), view.width)
+        return replace(view, image=image, alpha=alpha)
 
-    dataset = transparent_dataset()
-    return with_views(dataset, lambda v: replace(v, image=finer(v.image), alpha=finer(v.alpha)))
+    return with_views(transparent_dataset(), halved)
 
 
 def with_views(dataset: Dataset, change: Callable[[View], View]) -> Dataset:

@@ -71,7 +71,7 @@ QUICK_FITS = {
     "colors": (plain, COLORS, 4, 5),
     "depth and masks": (masked_with_depth, DEPTH, 4, 5),
     "random background": (transparent, {**RANDOM, **COARSE}, 2, 4),
-    "shifted pixels": (fits.finer_dataset, RANDOM, 11, 5),
+    "shifted pixels": (fits.shifted_dataset, RANDOM, 11, 5),
 }
 
 FITS = [

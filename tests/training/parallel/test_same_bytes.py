@@ -41,7 +41,7 @@ FITS = {
     "selection": (settings(**PRUNED, densify__prune__method="selection"), [1, 2, 3, 4], "plain"),
     "six views": (settings(6, **ADC), [1, 2, 3], "plain"),
     "effects": (settings(**EFFECTS), [1, 2, 3], "transparent"),
-    "shifted pixels": (settings(**STATIC), [2, 3], "finer"),
+    "shifted pixels": (settings(**STATIC), [2, 3], "shifted"),
     "late steps": (settings(**LATE), [2, 3], "plain"),
     # Derivatives of a camera are summed over all processes in one place.
     "refined cameras": (settings(**REFINED), [1, 2, 3, 4], "plain"),
