@@ -704,7 +704,7 @@ IDEAS = (
     Idea(
         "files of twice the size are halved with shifted pixels, four ways in turn",
         PixelsAsTheyAre(),
-        "learns fewer pixels by heart; gains more the longer a fit is",
+        "learns fewer pixels by heart; not for photographs",
         is_kept=True,
         scenes=(SHIPPED, LEGO),
     ),
@@ -786,7 +786,7 @@ IDEAS = (
     Idea(
         "vignetting and a response curve, found after the fit",
         VignettingAndResponse(),
-        "",
+        "these cameras have none to speak of",
         scenes=PHOTOGRAPHS,
     ),
     Idea("random start", Given({"init.start": "random"}), "much worse", scenes=(HEAD,)),
