@@ -29,16 +29,20 @@ class Stage:
     """Iterations that train on images of one size."""
 
     until: float  # last iteration
-    views: list[TrainingView]
-    shifted: list[list[TrainingView]]  # each view's, itself first: see shift_pixels
+    shifted: list[list[TrainingView]]  # of each view, itself first: see images.shift_pixels
     pixel_bytes: int  # see bytes_per_pixel
     room: int  # bytes left for targets and uploads that stay on the device
     kept: set[TrainingView] = field(default_factory=set)  # their views
 
+    @property
+    def views(self) -> list[TrainingView]:
+        """The training views, not shifted."""
+        return [views[0] for views in self.shifted]
+
     def view(self, index: int, iteration: int) -> TrainingView:
-        """Return the view of that index for an iteration: its shifted ones take turns by round."""
-        shifted = self.shifted[index]
-        return shifted[(iteration - 1) // len(self.views) % len(shifted)]
+        """Return the view of an index for an iteration: its shifted ones take turns by round."""
+        views = self.shifted[index]
+        return views[(iteration - 1) // len(self.shifted) % len(views)]
 
     def keep_or_free(self, view: TrainingView) -> None:
         """Keep targets and uploads of a rendered view while there is room, else free them.
@@ -73,14 +77,13 @@ def make_stages(
     window = config.loss.window, config.loss.sigma
     stages = []
     for until, resized in [*sizes, (math.inf, views)]:
-        of_photographs = [(view,) if is_refined else shift_pixels(view) for view in resized]
-        sensors = iter(make_sensors(list(chain(*of_photographs)), calibrated=is_refined))
-        shifted = [
-            [TrainingView(view, index, next(sensors), effects, window) for view in of_photograph]
-            for index, of_photograph in enumerate(of_photographs)
+        shifted = [(view,) if is_refined else shift_pixels(view) for view in resized]
+        sensors = iter(make_sensors(list(chain(*shifted)), calibrated=is_refined))
+        training_views = [
+            [TrainingView(view, index, next(sensors), effects, window) for view in views_of_one]
+            for index, views_of_one in enumerate(shifted)
         ]
-        whole = [training_views[0] for training_views in shifted]
-        stages.append(Stage(until, whole, shifted, bytes_per_pixel(effects), room))
+        stages.append(Stage(until, training_views, bytes_per_pixel(effects), room))
     return stages
 
 
@@ -126,7 +129,7 @@ def plan_step(
     is_late = rates.means.progress(first) > config.optimizer.views_from
     is_settled = first >= config.densify.first_fixed_iteration(config.iterations)
     late_views = config.optimizer.views if is_late and is_settled else 1
-    order = len(stage.views), config.seed, views_per_step
+    order = len(stage.shifted), config.seed, views_per_step
     return Step(
         iterations=iterations,
         stage=stage,
