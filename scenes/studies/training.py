@@ -1,4 +1,4 @@
-"""Fit the shipped scene at 200x200 with other lengths and settings; takes half an hour.
+"""Fit the shipped scene at 200x200 with other lengths and settings; takes 20 minutes.
 
 ``scenes/lego_mini.yml`` is fitted with different numbers of iterations, and with one other choice
 at a time: smaller images first, fewer Gaussians, spherical harmonics of a lower degree, no SSIM.
