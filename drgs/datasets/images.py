@@ -266,12 +266,19 @@ def compact_photograph(
     shape = (new_height, new_width)
     if channels == 3:
         return LazyImage((*shape, 3), image, pixels.nbytes), None
-    is_halved = (width, height) == (2 * new_width, 2 * new_height)
-    shifted = (image, alpha) if is_halved else (None, None)
+    shifted = (image, alpha) if can_shift(pixels, (new_width, new_height)) else (None, None)
     return (
         LazyImage((*shape, 3), image, pixels.nbytes, shifted[0]),
         LazyImage(shape, alpha, 0, shifted[1]),
     )
+
+
+def can_shift(pixels: np.ndarray, size: tuple[int, int]) -> bool:
+    """Return whether pixels have alpha, and twice the width and height of ``size``.
+
+    Files with alpha have 8 bits: :func:`compact_photograph` keeps their pixels.
+    """
+    return pixels.shape == (2 * size[1], 2 * size[0], 4)
 
 
 def _shift(pixels: np.ndarray, x: int, y: int) -> np.ndarray:
@@ -325,17 +332,24 @@ def placeholder_pixels(file: Path) -> np.ndarray:
     return np.broadcast_to(np.uint8(0), (*header.size[::-1], 4 if header.has_alpha else 3))
 
 
-def unread_image(shape: tuple[int, ...], name: object) -> LazyImage:
-    """Return an image that raises if its numbers are read."""
+def unread_image(shape: tuple[int, ...], name: object, is_shifted: bool = False) -> LazyImage:
+    """Return an image that raises if its numbers are read.
 
-    def refuse() -> np.ndarray:
+    is_shifted: whether the process that has it shifts its pixels: cameras are the same on all.
+    """
+
+    def refuse(*_: int) -> np.ndarray:
         raise RuntimeError(f"{name}: another process has its image")
 
-    return LazyImage(shape, refuse, nbytes=0)
+    return LazyImage(shape, refuse, 0, refuse if is_shifted else None)
 
 
 def without_images(view: View) -> View:
     """Return the view as if another process had read its images."""
-    there = {name: getattr(view, name) for name in ("image", "alpha", "mask", "depth")}
-    unread = {name: unread_image(p.shape, view.name) for name, p in there.items() if p is not None}
+    unread = {}
+    for name in ("image", "alpha", "mask", "depth"):
+        plane = getattr(view, name)
+        if plane is not None:
+            is_shifted = isinstance(plane, LazyImage) and plane.shifted is not None
+            unread[name] = unread_image(plane.shape, view.name, is_shifted)
     return replace(view, **unread)

@@ -21,6 +21,7 @@ from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
 from drgs.datasets.images import (
     Pixels,
+    can_shift,
     check_memory,
     compact_mask,
     compact_photograph,
@@ -264,11 +265,12 @@ def _read_images(config: DataConfig, frame: TransformsFrame, pixels: np.ndarray)
 
 def _unread_images(frame: TransformsFrame, pixels: np.ndarray, size: tuple[int, int]) -> Images:
     """Return images that raise if their numbers are read."""
-    (width, height), file = size, frame.files["image"]
-    plane = unread_image((height, width), file)
-    there = (pixels.shape[2] == 4, "mask" in frame.files, "depth" in frame.files)
-    alpha, mask, depth = (plane if is_there else None for is_there in there)
-    return unread_image((height, width, 3), file), alpha, mask, depth
+    shape, file, is_shifted = size[::-1], frame.files["image"], can_shift(pixels, size)
+    image = unread_image((*shape, 3), file, is_shifted)
+    alpha = unread_image(shape, file, is_shifted) if pixels.shape[2] == 4 else None
+    plane = unread_image(shape, file)
+    mask, depth = (plane if name in frame.files else None for name in ("mask", "depth"))
+    return image, alpha, mask, depth
 
 
 def _mask(config: DataConfig, file: Path, size: tuple[int, int]) -> Pixels:

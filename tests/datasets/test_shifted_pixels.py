@@ -9,6 +9,8 @@ import pytest
 from support import small_fits as fits
 from support.datasets import edit, load, view_at
 
+from drgs.config.schema import DataConfig
+from drgs.datasets import load_dataset
 from drgs.datasets.images import (
     compact_photograph,
     shift_pixels,
@@ -36,6 +38,7 @@ def test_views_of_shifted_pixels_have_what_is_on_their_rays():
         x = (column - shifted.cx) / shifted.fx * view.fx + view.cx
         y = (row - shifted.cy) / shifted.fy * view.fy + view.cy
         for found, expected in ((shifted.image[..., 0], x / 12), (shifted.image[..., 1], y / 8)):
+            # The file's numbers are rounded to bytes.
             np.testing.assert_allclose(found[:-1, :-1], expected[:-1, :-1], atol=0.6 / 255)
 
 
@@ -44,7 +47,7 @@ def test_pixels_beyond_the_edge_repeat_it():
     plane = np.array([[1.0, 2, 3, 4], [5, 6, 7, 8]]) / 255
     right, below, both = shift_pixels(halved(view, np.stack([plane] * 4, axis=2)))[1:]
     expected = {"right": [4.5, 6], "below": [5.5, 7.5], "both": [6.5, 8]}
-    for name, shifted in (("right", right), ("below", below), ("both", both)):
+    for name, shifted in (("right", right), ("below", below), ("both", both)):  # in float32
         np.testing.assert_allclose(255 * np.asarray(shifted.alpha), [expected[name]], rtol=1e-6)
 
 
@@ -57,14 +60,25 @@ def test_only_files_of_twice_the_size_with_alpha_are_shifted(blender, photograph
     whole = np.stack([*colors, alpha], axis=2)
     for found, (x, y) in zip(shift_pixels(view), ((0, 0), (1, 0), (0, 1), (1, 1)), strict=True):
         expected = whole[y : y + 2, x : x + 4].reshape(1, 2, 2, 2, 4).mean(axis=(1, 3))
-        actual = np.dstack([found.image, found.alpha])
+        actual = np.dstack([found.image, found.alpha])  # float32
         np.testing.assert_allclose(actual[:1, :2], expected, atol=1e-6)
     views = [load(folder, image_size=size).train[1] for size in (None, 2, 4)]
     views += [load(photographs, image_size=4).train[0]]  # without alpha
-    views += [smaller_view(view, 3), without_images(view)]
+    views += [smaller_view(view, 3)]
     image = np.asarray(view.image)
     views += [replace(view, image=image), replace(view, alpha=image[..., 0])]
-    assert [len(shift_pixels(each)) for each in views] == [1] * 8
+    assert [len(shift_pixels(each)) for each in views] == [1] * 7
+
+
+def test_processes_without_an_image_have_the_same_cameras(blender):
+    """Images that another process has, as they are read and as they are given away."""
+    config = DataConfig(path=blender[0], image_size=3)
+    read, unread = load_dataset(config), load_dataset(config, lambda name: False)
+    expected = [view.K.tolist() for view in shift_pixels(read.train[1])]
+    for view in (unread.train[1], without_images(read.train[1])):
+        assert [each.K.tolist() for each in shift_pixels(view)] == expected
+        with pytest.raises(RuntimeError, match="another process"):
+            np.asarray(shift_pixels(view)[3].image)
 
 
 @pytest.mark.parametrize("plane", ["mask", "depth"])

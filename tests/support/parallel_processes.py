@@ -22,9 +22,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from drgs.datasets.images import without_images
 from drgs.datasets.types import CameraMotion, View
+from drgs.initialization.defaults import resolve_defaults
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.parallel.communicator import Communicator
+from drgs.training.parallel.population import own_views
 from drgs.training.trainer import Trainer
 from support import small_fits as fits
 
@@ -152,7 +155,10 @@ def main() -> None:
     task = json.loads(sys.argv[1])
     dataset = DATASETS[task["data"]]()
     comm = Communicator.world()
-    config = fits.config_of(**task["changes"])
+    config = resolve_defaults(fits.config_of(**task["changes"]), dataset)  # reads all images
+    own = own_views(len(dataset.train), config.optimizer.views_per_step, comm.rank, comm.size)
+    train = (v if i in own else without_images(v) for i, v in enumerate(dataset.train))
+    dataset = replace(dataset, train=tuple(train))
     trainer = Trainer(config, dataset, fits.disturbed_blobs(), comm)
     if "spoiled" in task:
         found = spoiled(trainer, task["spoiled"])
