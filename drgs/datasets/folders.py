@@ -25,7 +25,7 @@ MAX_PIXELS = 600_000
 """Pixels of an image that is fitted, as 894 x 671. The width of larger ones is divided by the
 smallest whole number that brings them there, and rounded down."""
 
-ITERATIONS = {"nerf_synthetic": 3000, "nerfstudio": 4000, "colmap": 4000}
+ITERATIONS = {"nerf_synthetic": 3000, "nerfstudio": 4000, "colmap": 4500}
 """Iterations by layout, as ``scenes/lego.yml`` and ``scenes/photos.yml`` have them."""
 
 NAMES = {
@@ -82,7 +82,7 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
     sizes = [image_size(file) for file in reader.image_files(given.data)]
     width, height = max(sizes, key=lambda size: (math.prod(size), size[1]))
     data = {"path": folder, "type": layout, "image_size": _max_width(width, height, sizes)}
-    values = {"data": data, "iterations": ITERATIONS.get(layout, 4000)}
+    values = {"data": data, "iterations": ITERATIONS.get(layout, 4500)}
     config = config_from(values, where, overrides)
     size = "as they are"
     if (config.data.image_size or width) < width:

@@ -20,7 +20,7 @@ def test_photographs_use_the_settings_of_photos_yml(tmp_path):
     assert config.data.path == tmp_path and config.data.type == "colmap"
     assert config.data.image_size == 640 and "as they are" in reasons
     assert config.iterations == example.iterations
-    assert "COLMAP's model" in reasons and "4,000 iterations" in reasons
+    assert "COLMAP's model" in reasons and "4,500 iterations" in reasons
     for section in ("init", "model", "optimizer", "loss", "densify", "coarse"):
         assert getattr(config, section) == getattr(example, section)
     given, _ = config_for(tmp_path, ["data.image_size=100", "iterations=30", "seed=3"])
