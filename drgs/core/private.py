@@ -10,7 +10,9 @@ To recheck with Dr.Jit 1.6 and Mitsuba 3.10, which are not released yet:
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -66,6 +68,40 @@ def llvm_vector_width() -> int:
         return _llvm_function("_Z21jit_llvm_vector_widthv", ctypes.c_uint32)()
     except (AttributeError, OSError):
         return 0
+
+
+@contextmanager
+def access_all_lanes(array_type: type[dr.ArrayBase]) -> Iterator[None]:
+    """Access memory in all lanes of the loop that is being traced, not in its active ones only.
+
+    For accesses that are valid in every lane and, where a lane is not active, change nothing: a
+    selection for each is saved. array_type: of the LLVM backend, or else nothing changes.
+
+    Relies on Dr.Jit taking the mask of an access from the top of a stack.
+    """
+    functions = _mask_functions() if dr.backend_v(array_type) == dr.JitBackend.LLVM else None
+    if functions is None:
+        yield
+        return
+    push, pop = functions
+    backend = int(dr.JitBackend.LLVM.value)
+    everywhere = dr.mask_t(array_type)(True)
+    push(backend, ctypes.c_uint32(everywhere.index))
+    try:
+        yield
+    finally:
+        pop(backend)
+
+
+@cache
+def _mask_functions() -> tuple[ctypes._NamedFuncPointer, ctypes._NamedFuncPointer] | None:
+    try:
+        return (
+            _llvm_function("_Z17jit_var_mask_push10JitBackendj", None),
+            _llvm_function("_Z16jit_var_mask_pop10JitBackend", None),
+        )
+    except (AttributeError, OSError):
+        return None
 
 
 def disable_avx512() -> None:

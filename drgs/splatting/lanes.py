@@ -13,7 +13,8 @@ from typing import TypeVar
 import drjit as dr
 from typing_extensions import override
 
-from drgs.core.arrays import divide, types_of, with_aligned_stack
+from drgs.core.arrays import divide, reinterpret, types_of, with_aligned_stack
+from drgs.core.private import access_all_lanes
 from drgs.core.types import Bool, Float, UInt32
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, Lanes, TileGrid
 from drgs.splatting.tiles import WORD, TileBins
@@ -24,22 +25,24 @@ T = TypeVar("T", Float, UInt32)
 def make_lanes(
     Float: type, grid: TileGrid, order: UInt32 | None = None, tiles: range | None = None
 ) -> Lanes:
-    """Return lanes in an order that spreads neighbouring tiles over the launch.
+    """Return lanes in an order that spreads the parts of the image over the launch.
 
-    Dr.Jit splits a small launch into few blocks of consecutive lanes. Tiles are visited with a
-    stride near the golden section, so that each block gets a share of the image's busy centre.
+    Dr.Jit splits a small launch into few blocks of consecutive lanes. Groups of neighbouring tiles,
+    whose memory is close together, are visited with a stride near the golden section, so that each
+    block gets a share of the image's busy centre.
 
     order: UInt32, a permutation of the lanes; None: unchanged. tiles: range of the tiles of all
     samples; None: all.
     """
     t = types_of(Float)
     tiles = grid.tiles_of(range(grid.samples)) if tiles is None else tiles
-    stride = _coprime_stride(len(tiles))
+    num_groups = len(tiles) // _GROUP  # the tiles beyond them come last
+    stride = _coprime_stride(max(num_groups, 1))
     lane = dr.arange(t.UInt32, len(tiles) * MICROS) if order is None else order
     turn, micro = lane // MICROS, lane % MICROS
-    tile = t.UInt32(
-        (t.UInt64(turn) * dr.opaque(t.UInt64, stride)) % dr.opaque(t.UInt64, len(tiles))
-    )
+    group = t.UInt64(turn // _GROUP) * dr.opaque(t.UInt64, stride)
+    spread = t.UInt32(group % dr.opaque(t.UInt64, max(num_groups, 1))) * _GROUP + turn % _GROUP
+    tile = dr.select(turn < dr.opaque(t.UInt32, num_groups * _GROUP), spread, turn)
     tile += dr.opaque(t.UInt32, tiles.start)
     micro_tile = tile * MICROS + micro
     sample, tile = divide(tile, grid.num_tiles, grid.samples)
@@ -84,7 +87,8 @@ def _sort_in_blocks(level: UInt32) -> UInt32:
     return order
 
 
-_BLOCK = 32 * MICROS
+_GROUP = 32  # tiles
+_BLOCK = _GROUP * MICROS
 """Number of lanes that are sorted together. In larger blocks, the lanes of a tile, which read the
 same records, are too far apart; in smaller ones, lengths differ more."""
 
@@ -114,7 +118,7 @@ class Entries:
 
     def __init__(self, bins: TileBins, lanes: Lanes, end: UInt32) -> None:
         UInt32 = type(lanes.tile)
-        self.words, self.micro, self.sample = bins.words, lanes.micro, lanes.sample
+        self.words, self.micro, self.sample, self.end = bins.words, lanes.micro, lanes.sample, end
         start = dr.gather(UInt32, bins.tile_start, lanes.tile)
         occupied = start < end
         # An empty lane gets first == last and no bits: it is over before it begins.
@@ -126,7 +130,7 @@ class Entries:
 
     def begin(self) -> Cursor:
         """The cursor at the first entry."""
-        return self._open(self.first, True)
+        return self._open(self.first)
 
     def pending(self, cursor: Cursor) -> Bool:
         """Return lanes that may have entries left."""
@@ -136,9 +140,15 @@ class Entries:
     def current(cursor: Cursor) -> tuple[UInt32, Bool]:
         """The current sorted entry, and whether there is one (a word may be empty).
 
-        Where there is none, the index lies between the entries before and those to come.
+        Where there is none, it is one of the entries of the cursor's group.
         """
-        return cursor.group * WORD + dr.tzcnt(cursor.word), cursor.word != 0
+        return cursor.group * WORD + find_lowest_bit(cursor.word), cursor.word != 0
+
+    def end_of(self, cursor: Cursor) -> UInt32:
+        """Return an index behind the current entry and those before it, not behind later ones."""
+        entry, active = self.current(cursor)
+        behind = dr.select(active, entry, cursor.group * WORD + (WORD - 1)) + 1
+        return dr.minimum(behind, self.end)
 
     def advance(self, cursor: Cursor) -> Cursor:
         """Drop the current entry; open the next group when this one is used up."""
@@ -147,11 +157,14 @@ class Entries:
 
     def _go_on(self, cursor: Cursor, word: UInt32, neighbor: UInt32, has_neighbor: Bool) -> Cursor:
         used_up = (word == 0) & has_neighbor
-        opened = self._open(dr.select(used_up, neighbor, cursor.group), used_up)
+        with access_all_lanes(type(word)):  # every lane has a group
+            opened = self._open(dr.select(used_up, neighbor, cursor.group))
         return Cursor(word=dr.select(used_up, opened.word, word), group=opened.group)
 
-    def _open(self, group: UInt32, active: Bool | bool) -> Cursor:
-        word = dr.gather(type(group), self.words, group * MICROS + self.micro, active)
+    def _open(self, group: UInt32) -> Cursor:
+        t = types_of(type(group))
+        pair = dr.gather(t.Array2u, self.words, group * (MICROS // 2) + self.micro // 2)
+        word = dr.select((self.micro & 1) != 0, pair[1], pair[0])
         word &= dr.select(group == self.first, self.head, 0xFFFFFFFF)
         word &= dr.select(group == self.last, self.tail, 0xFFFFFFFF)
         return Cursor(word=word, group=group)
@@ -163,7 +176,7 @@ class EntriesBackToFront(Entries):
     @override
     def begin(self) -> Cursor:
         """The cursor at the last entry."""
-        return self._open(self.last, True)
+        return self._open(self.last)
 
     @override
     def pending(self, cursor: Cursor) -> Bool:
@@ -172,13 +185,12 @@ class EntriesBackToFront(Entries):
     @staticmethod
     @override
     def current(cursor: Cursor) -> tuple[UInt32, Bool]:
-        return cursor.group * WORD + _highest_bit(cursor.word), cursor.word != 0
+        return cursor.group * WORD + _find_highest_bit(cursor.word), cursor.word != 0
 
     @override
     def advance(self, cursor: Cursor) -> Cursor:
         """Drop the current entry; open the group before when this one is used up."""
-        bit = (type(cursor.word)(1) << (WORD - 1)) >> dr.lzcnt(cursor.word)
-        word = cursor.word & ~bit
+        word = cursor.word & ~(type(cursor.word)(1) << _find_highest_bit(cursor.word))
         return self._go_on(cursor, word, cursor.group - 1, cursor.group > self.first)
 
 
@@ -186,7 +198,7 @@ def count_entries(entries: Entries) -> UInt32:
     """Count the entries of each lane."""
 
     def body(group: UInt32, count: UInt32) -> tuple[UInt32, UInt32]:
-        return group + 1, count + dr.popcnt(entries._open(group, True).word)
+        return group + 1, count + dr.popcnt(entries._open(group).word)
 
     UInt32 = type(entries.first)
     _, count = dr.while_loop(
@@ -197,8 +209,27 @@ def count_entries(entries: Entries) -> UInt32:
     return count
 
 
-def _highest_bit(word: UInt32) -> UInt32:
-    return (WORD - 1) - dr.lzcnt(word)
+def find_lowest_bit(word: UInt32) -> UInt32:
+    """Return the index of the lowest bit that is set, by the exponent of a floating point number.
+
+    AVX2 has no instruction for it. Of no bit: any number below 32.
+    """
+    return _exponent(_to_float(word & (0 - word))) & (WORD - 1)
+
+
+def _find_highest_bit(word: UInt32) -> UInt32:
+    """Return the index of the highest bit that is set; of no bit: 0."""
+    # The bit below the highest one is removed, or the conversion could round up to the next power.
+    return _exponent(_to_float((word & ~(word >> 1)) >> 1) + 0.5) + 1
+
+
+def _to_float(word: UInt32) -> Float:
+    return dr.float32_array_t(type(word))(reinterpret(dr.int32_array_t(type(word)), word))
+
+
+def _exponent(value: Float) -> UInt32:
+    """Return the exponent, above it the sign."""
+    return (reinterpret(dr.uint32_array_t(type(value)), value) >> 23) - 127
 
 
 def load_pixels(plane: Float, lanes: Lanes, grid: TileGrid) -> list[Float]:

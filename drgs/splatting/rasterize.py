@@ -42,13 +42,24 @@ and writes them into the slot of this (splat, micro-tile) pair: see
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import reduce
+from operator import and_
 from typing import cast
 
 import drjit as dr
 
-from drgs.core.arrays import Rows, divide, quotient, reinterpret, scatter_rows, types_of
+from drgs.core.arrays import (
+    Rows,
+    divide,
+    quotient,
+    reinterpret,
+    scatter_rows,
+    types_of,
+    variables_of,
+)
+from drgs.core.private import access_all_lanes
 from drgs.core.types import Array2f, Bool, Float, Int32, UInt32
 from drgs.splatting.footprint import Alpha, SplatFeatures
 from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
@@ -144,6 +155,11 @@ class Records:
         numbers = self.rows.load(entry, active)
         return numbers[: self.num_geometry], numbers[self.num_geometry :][: self.num_features]
 
+    def load_anywhere(self, entry: UInt32, active: Bool) -> tuple[list[Float], list[Float]]:
+        """Return the same, with the geometry of any splat on lanes that are not active."""
+        geometry, features = self.load(entry, True)
+        return geometry, [dr.select(active, number, 0) for number in features]
+
     def load_keys(self, entry: UInt32, active: Bool | bool) -> list[Float]:
         """Return keys of a sorted entry."""
         return self.rows.load(entry, active)[self.num_geometry + self.num_features :]
@@ -167,44 +183,50 @@ def composite(bins: TileBins, records: Records) -> Layers:
     model = bins.model.bind(lanes, bins.grid)
     count = model.features.num_planes(bins.num_features)
 
-    def body(cursor: Cursor, pixels: list, unfinished: Bool) -> tuple:
-        entry, active = entries.current(cursor)
-        geometry, features = records.load(entry, active)
-        footprint = model.footprint(geometry, lanes, active)
-        behind = dr.select(active, entry + 1, entry)
-        composited = []
-        for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
-            T, *C, end = pixels[pixel]
-            weight, T, goes_on = composite_step(T, alpha.value, stop)
-            end = dr.select(goes_on, behind, end)
-            composited.append([T, *model.features.add(C, features, pixel, weight), end])
-        return entries.advance(cursor), composited, any_unfinished([T for T, *_ in composited])
+    size, planes = dr.width(lanes.tile), 1 + count
+    zero, stop = dr.zeros(t.Float, size), model.cutoffs.transmittance_stop
+    # Pixels off the film are finished before they begin.
+    first = [dr.select(inside, t.Float(1), -1) for _, inside in pixels_of(lanes, bins.grid)]
 
-    stop = model.cutoffs.transmittance_stop
-    size = dr.width(lanes.tile)
-    nothing = [*[dr.zeros(t.Float, size)] * count, dr.zeros(t.UInt32, size)]
-    # Pixel by pixel: Dr.Jit orders instructions by the state that they compute, and the values of
-    # one pixel then stay in registers.
-    _, pixels, _ = dr.while_loop(
+    def body(
+        cursor: Cursor, values: dr.Local[Float], ends: dr.Local[UInt32], unfinished: Bool
+    ) -> tuple:
+        entry, active = entries.current(cursor)
+        behind = entries.end_of(cursor)
+        cursor = entries.advance(cursor)
+        signs: Int32 | int = -1
+        # On a lane that is not active, alpha is zero and nothing changes.
+        with access_all_lanes(t.Float):
+            geometry, features = records.load_anywhere(entry, active)
+            footprint = model.footprint(geometry, lanes, active)
+            for pixel, alpha in enumerate(list(model.alphas(geometry, footprint, active))):
+                T, *C = (values[planes * pixel + k] for k in range(planes))
+                weight, T, goes_on = composite_step(T, alpha.value, stop)
+                signs &= sign_bits(T)
+                C = model.features.add(C, features, pixel, weight)
+                for k, value in enumerate([T, *C]):
+                    values[planes * pixel + k] = value
+                ends[pixel] = dr.select(goes_on, behind, ends[pixel])
+        return cursor, values, ends, signs >= 0
+
+    _, values, ends, _ = dr.while_loop(
         state=(
             entries.begin(),
-            # Pixels off the film are finished before they begin.
-            [
-                [dr.select(inside, t.Float(1), -1), *[type(x)(x) for x in nothing]]
-                for _, inside in pixels_of(lanes, bins.grid)
-            ],
+            variables_of([number for T in first for number in (T, *[zero] * count)]),
+            variables_of([dr.zeros(t.UInt32, size)] * PIXELS),
             dr.full(t.Bool, True, size),
         ),
-        cond=lambda cursor, pixels, unfinished: entries.pending(cursor) & unfinished,
+        cond=lambda cursor, values, ends, unfinished: entries.pending(cursor) & unfinished,
         body=body,
     )
-    dr.eval(pixels)
-    T, *planes, ends = zip(*pixels, strict=True)
-    columns = [dr.abs(v) for v in T] + [v for plane in planes for v in plane]
+    columns = [values[planes * pixel + k] for k in range(planes) for pixel in range(PIXELS)]
+    columns[:PIXELS] = [dr.abs(T) for T in columns[:PIXELS]]
+    ends = [ends[pixel] for pixel in range(PIXELS)]
+    dr.eval(columns, ends)
     layers = Layers(
         values=scatter_rows(columns, lanes.micro_tile, size),
-        ends=scatter_rows([*ends], lanes.micro_tile, size),
-        stop=scatter_rows([largest([*ends])], lanes.micro_tile, size),
+        ends=scatter_rows(ends, lanes.micro_tile, size),
+        stop=scatter_rows([largest(ends)], lanes.micro_tile, size),
         count=count,
         grid=bins.grid,
     )
@@ -212,13 +234,14 @@ def composite(bins: TileBins, records: Records) -> Layers:
     return layers
 
 
+def sign_bits(value: Float) -> Int32:
+    """Return an integer, of the number's size, that is negative where the number is."""
+    return reinterpret(cast("type[Int32]", dr.int_array_t(type(value))), value)
+
+
 def any_unfinished(transmittances: list[Float]) -> Bool:
-    """Return lanes with a transmittance that is not negative, from the bits that all share."""
-    Int = cast("type[Int32]", dr.int_array_t(type(transmittances[0])))
-    shared = reinterpret(Int, transmittances[0])
-    for T in transmittances[1:]:
-        shared &= reinterpret(Int, T)
-    return shared >= 0
+    """Return lanes with a transmittance that is not negative."""
+    return reduce(and_, map(sign_bits, transmittances)) >= 0
 
 
 def largest(values: list[UInt32]) -> UInt32:
@@ -310,71 +333,78 @@ def _partials(
     model = bins.model.bind(lanes, bins.grid)
 
     g = [load_pixels(plane, lanes, bins.grid) for plane in d_features]
-    ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
+    ends = [reinterpret(t.Int32, x) for x in load_lane_row(layers.ends, lanes.micro_tile, 1)]
     transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
-    partials = Rows.empty(t.Float, bins.num_sums, max(slots.band.num_slots, 1))
+    partials = Rows.empty(t.Float, bins.num_sums, slots.band.num_slots + 1)
 
-    # A packet is stored with a branch for each lane, across which registers are spilled. An
-    # iteration therefore starts by storing the sums of the last one.
-    def body(cursor: Cursor, slot: UInt32, pixels: list, sums: list, is_summed: Bool) -> tuple:
-        partials.store(sums, slot, is_summed)
+    last_slot = dr.opaque(t.UInt32, slots.band.num_slots)
+    behind = load_pixels(d_transmittance, lanes, bins.grid)
+
+    def body(cursor: Cursor, slot: UInt32, pixels: dr.Local[Float]) -> tuple:
         entry, active = entries.current(cursor)
         slot = dr.select(active, slot - 1, slot)
-        geometry, features = records.load(entry, active)
-        footprint = model.footprint(geometry, lanes, active)
-        alphas = model.alphas(geometry, footprint)
-        composited = [entry < end for end in ends]
-        pixels, d_log_alpha, d_features = _adjoint_step(
-            alphas, composited, features, model.features, pixels, g
-        )
-        moments = model.falloff.moments(footprint, d_log_alpha, model.positions)
-        return entries.advance(cursor), slot, pixels, moments + d_features, active
+        cursor = entries.advance(cursor)
+        # On a lane that is not active, alpha is zero and no pixel changes.
+        with access_all_lanes(t.Float):
+            geometry, features = records.load_anywhere(entry, active)
+            footprint = model.footprint(geometry, lanes, active)
+            d_features = [t.Float(0) for _ in features]
+            # Comparing unsigned numbers takes more instructions.
+            composited = (reinterpret(t.Int32, entry) < end for end in ends)
+            alphas = model.alphas(geometry, footprint, active)
+            d_log_alphas = _adjoint_step(
+                zip(alphas, composited, strict=True),
+                features,
+                model.features,
+                pixels,
+                g,
+                d_features,
+            )
+            moments = model.falloff.moments(footprint, d_log_alphas, model.positions)
+            # All lanes store: with a mask, each has a branch.
+            partials.store(moments + d_features, dr.select(active, slot, last_slot))
+        return cursor, slot, pixels
 
-    size = dr.width(lanes.tile)
-    zero = dr.zeros(t.Float, size)
-    behind = load_pixels(d_transmittance, lanes, bins.grid)
     loop = dr.while_loop(
         state=(
             entries.begin(),
             slots.end(entries),
-            [[*pixel] for pixel in zip(transmittance, behind, strict=True)],
-            [t.Float(zero) for _ in range(bins.num_sums)],
-            dr.full(t.Bool, False, size),
+            variables_of([v for pixel in zip(transmittance, behind, strict=True) for v in pixel]),
         ),
-        cond=lambda cursor, slot, pixels, sums, is_summed: entries.pending(cursor) | is_summed,
+        cond=lambda cursor, slot, pixels: entries.pending(cursor),
         body=body,
     )
-    dr.eval(loop, partials)
+    dr.eval(loop[:2], partials)
     return partials
 
 
 def _adjoint_step(
-    alphas: list[Alpha],
-    composited: list[Bool],
+    alphas: Iterable[tuple[Alpha, Bool]],
     stored: list[Float],
     features: SplatFeatures,
-    pixels: list[list[Float]],
+    pixels: dr.Local[Float],
     g: list[list[Float]],
-) -> tuple[list, list, list]:
-    """Return T and b before a splat at 16 pixels, d loss / d ln(alpha), and d loss / d stored.
+    d_stored: list[Float],
+) -> Iterator[Float]:
+    """Yield d loss / d ln(alpha) of a splat at 16 pixels.
 
-    composited: whether each pixel was unfinished; stored: the splat's stored numbers; features:
-    their values at a pixel; pixels: T and b of each, behind the splat; g: [plane][pixel] derivative
-    of the loss with respect to C.
+    alphas: with whether each pixel was unfinished; stored: the splat's stored numbers; features:
+    their values at a pixel; pixels: T and b of each, behind the splat, replaced by those before it;
+    g: [plane][pixel] derivative of the loss with respect to C; d_stored: derivatives of the stored
+    numbers, to which the pixels' are added.
     """
-    zero = type(pixels[0][0])(0)
-    before, d_log_alpha, d_stored = [], [], [zero for _ in stored]
-    for pixel, (alpha, (T, behind)) in enumerate(zip(alphas, pixels, strict=True)):
-        value = dr.select(composited[pixel], alpha.value, 0)
+    for pixel, (alpha, composited) in enumerate(alphas):
+        T, behind = pixels[2 * pixel], pixels[2 * pixel + 1]
+        value = dr.select(composited, alpha.value, 0)
         T = T / (1 - value)
         weight = value * T
         g_pixel = [plane[pixel] for plane in g]
-        d_stored = features.add_derivatives(d_stored, stored, pixel, weight, g_pixel)
+        d_stored[:] = features.add_derivatives(d_stored, stored, pixel, weight, g_pixel)
         gain = features.feature_gradient(stored, pixel, g_pixel) - behind
-        before.append([T, dr.fma(value, gain, behind)])
+        pixels[2 * pixel] = T
+        pixels[2 * pixel + 1] = dr.fma(value, gain, behind)
         # d loss / d ln(alpha) = a T (c.g - b), zero where alpha is clamped.
-        d_log_alpha.append(dr.select(alpha.smooth, weight * gain, 0))
-    return before, d_log_alpha, d_stored
+        yield dr.select(alpha.smooth, weight * gain, 0)
 
 
 def splat_gradients(
@@ -451,7 +481,7 @@ def composite_tangent(
         d_geometry, d_features = d_records.load(entry, active)
         d_log_alpha = model.falloff.tangent(geometry, footprint, d_geometry)
         T, dT, dC = list(T), list(dT), [list(c) for c in dC]
-        for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
+        for pixel, alpha in enumerate(model.alphas(geometry, footprint, active)):
             before, d_before = dr.abs(T[pixel]), dT[pixel]
             weight, T[pixel], goes_on = composite_step(T[pixel], alpha.value, stop)
             d_alpha = dr.select(alpha.smooth, alpha.value * d_log_alpha[pixel], 0)

@@ -19,9 +19,10 @@ import drjit as dr
 import numpy as np
 
 from drgs.core.arrays import Rows, divide, interleave, repeat_array, types_of
+from drgs.core.private import access_all_lanes
 from drgs.core.types import Array2u, Bool, Float, UInt32
 from drgs.splatting.grid import MICROS
-from drgs.splatting.lanes import Entries
+from drgs.splatting.lanes import Entries, find_lowest_bit
 from drgs.splatting.tiles import WORD, TileBins, transpose_masks
 
 BAND_SLOTS = 1 << 20
@@ -200,17 +201,21 @@ def sum_entries(
     count = max(len(slots.band.entries), 1)
     entry = dr.opaque(t.UInt32, slots.band.entries.start) + dr.arange(t.UInt32, count)
     group, below = entry // WORD, (t.UInt32(1) << (entry % WORD)) - 1
+    zero, micros = dr.zeros(t.Float, count), dr.gather(t.UInt32, pairs.masks, entry)
+    group = dr.select(micros != 0, group, slots.first_group)
+    spare = dr.opaque(t.UInt32, slots.band.num_slots)
 
     def body(micros: UInt32, totals: list) -> tuple:
         for _ in range(2):  # two at a time wait for memory together
             active = micros != 0
-            first, word = slots.locate(group, dr.tzcnt(micros), active)
-            numbers = partials.load(first + dr.popcnt(word & below), active)
-            totals = [a + b for a, b in zip(totals, numbers, strict=True)]
+            with access_all_lanes(t.Float):
+                first, word = slots.locate(group, find_lowest_bit(micros) % MICROS)
+                slot = dr.select(active, first + dr.popcnt(word & below), spare)
+                numbers = partials.load(slot)
+            totals = [a + dr.select(active, b, 0) for a, b in zip(totals, numbers, strict=True)]
             micros = micros & (micros - 1)
         return micros, totals
 
-    zero, micros = dr.zeros(t.Float, count), dr.gather(t.UInt32, pairs.masks, entry)
     _, totals = dr.while_loop(
         state=(
             t.UInt32(micros),

@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import drjit as dr
 import numpy as np
@@ -40,6 +41,29 @@ def test_same_variables_compares_identity():
     a, b = Float(1, 2), Float(1, 2)
     assert private.same_variables([a, {"b": b}], (a, b))
     assert not private.same_variables(a, b)
+
+
+def increment_in_a_loop(context):
+    """Add 1 to a variable in each trip of a loop, of which lane i takes part in i."""
+    trips = dr.arange(UInt32, 4)
+
+    def body(trip, variable):
+        with context:
+            variable[0] = variable[0] + 1
+        return trip + 1, variable
+
+    variable = dr.alloc_local(Float, 1)
+    variable[0] = dr.zeros(Float, 4)
+    _, variable = dr.while_loop(
+        (dr.zeros(UInt32, 4), variable), lambda trip, variable: trip < trips, body
+    )
+    return list(variable[0])
+
+
+def test_accesses_reach_all_lanes_or_those_of_the_loop():
+    assert increment_in_a_loop(nullcontext()) == [0, 1, 2, 3]
+    assert increment_in_a_loop(private.access_all_lanes(Float)) == [3, 3, 3, 3]
+    assert increment_in_a_loop(nullcontext()) == [0, 1, 2, 3]
 
 
 def test_llvm_version_is_known():
