@@ -185,8 +185,10 @@ def composite(bins: TileBins, records: Records) -> Layers:
 
     size, planes = dr.width(lanes.tile), 1 + count
     zero, stop = dr.zeros(t.Float, size), model.cutoffs.transmittance_stop
-    # Pixels off the film are finished before they begin.
-    first = [dr.select(inside, t.Float(1), -1) for _, inside in pixels_of(lanes, bins.grid)]
+    start = dr.alloc_local(t.Float, planes * PIXELS, zero)
+    for pixel, (_, inside) in enumerate(pixels_of(lanes, bins.grid)):
+        # Pixels off the film are finished before they begin.
+        start[planes * pixel] = dr.select(inside, t.Float(1), -1)
 
     def body(
         cursor: Cursor, values: dr.Local[Float], ends: dr.Local[UInt32], unfinished: Bool
@@ -212,8 +214,8 @@ def composite(bins: TileBins, records: Records) -> Layers:
     _, values, ends, _ = dr.while_loop(
         state=(
             entries.begin(),
-            variables_of([number for T in first for number in (T, *[zero] * count)]),
-            variables_of([dr.zeros(t.UInt32, size)] * PIXELS),
+            start,
+            dr.alloc_local(t.UInt32, PIXELS, dr.zeros(t.UInt32, size)),
             dr.full(t.Bool, True, size),
         ),
         cond=lambda cursor, values, ends, unfinished: entries.pending(cursor) & unfinished,

@@ -31,7 +31,7 @@ from drgs.training.effects.base import TrainingEffect
 from drgs.training.parallel.inputs import share_gaussians
 from drgs.training.trainer import Trainer
 
-ITERATIONS_SHARE, TIME_SHARE = 0.05, 0.075
+ITERATIONS_SHARE, TIME_SHARE = 0.08, 0.12
 """Share of the fit's iterations, and of its time: late iterations take longer."""
 
 RATES = {
@@ -40,11 +40,11 @@ RATES = {
     "quats_lr": 4e-3,
     "scales_lr": 0.02,
     "opacities_lr": 0.07,
-    "sh0_lr": 0.06,
+    "sh0_lr": 0.03,
     "shN_lr": 4e-3,
     "decay": 0.1,
 }
-"""Learning rates: high because there are few iterations, highest for colours."""
+"""Learning rates: high because there are few iterations."""
 
 NEGLIGIBLE_RATE = 1e-9  # rate of values that are to stay, where 0 is not a rate
 

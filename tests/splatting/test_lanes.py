@@ -32,7 +32,7 @@ def test_of_no_bit_a_place_in_the_word_is_found():
 @pytest.mark.parametrize("precision", [FLOAT32, FLOAT64], ids=["float32", "float64"])
 @pytest.mark.parametrize("variance", [0.1, 0.3, 10.0])
 def test_moments_are_sums_over_the_pixels(precision, variance):
-    """Of splats no sharper than a low-pass filter; errors are a few roundings of the terms' sizes.
+    """Splats are no sharper than a low-pass filter; errors are a few roundings of the terms' sizes.
 
     Size: of a term in which the pixel is up to two pixels away.
     """

@@ -88,8 +88,8 @@ def test_tuning_keeps_the_population_and_continues_the_schedule():
     changes = {**NON_VIEWER_SETTINGS, "model.order": "pixel", "coarse": [{"until": 9, "factor": 2}]}
     config = with_changes(fits.config_of(iterations=400), changes)
     further = tuning(config)
-    assert further.iterations == 420 and further.densify.stop == 1 and further.coarse == []
-    assert further.optimizer.decay_from == 400 / 420
+    assert further.iterations == 432 and further.densify.stop == 1 and further.coarse == []
+    assert further.optimizer.decay_from == 400 / 432
     assert further.model.approximations.is_default and not config.model.approximations.is_default
     assert further.model.sh_degree == config.model.sh_degree
     assert further.loss == config.loss and further.data == config.data
