@@ -201,7 +201,7 @@ def composite(bins: TileBins, records: Records) -> Layers:
         with access_all_lanes(t.Float):
             geometry, features = records.load_anywhere(entry, active)
             footprint = model.footprint(geometry, lanes, active)
-            for pixel, alpha in enumerate(list(model.alphas(geometry, footprint, active))):
+            for pixel, alpha in enumerate(model.alphas(geometry, footprint, active)):
                 T, *C = (values[planes * pixel + k] for k in range(planes))
                 weight, T, goes_on = composite_step(T, alpha.value, stop)
                 signs &= sign_bits(T)
