@@ -87,8 +87,11 @@ def _sort_in_blocks(level: UInt32) -> UInt32:
     return order
 
 
-_GROUP = 32  # tiles
-_BLOCK = _GROUP * MICROS
+_GROUP = 8
+"""Tiles that stay together in the launch: with more, its parts take longer than others; with fewer,
+memory is further apart."""
+
+_BLOCK = 32 * MICROS
 """Number of lanes that are sorted together. In larger blocks, the lanes of a tile, which read the
 same records, are too far apart; in smaller ones, lengths differ more."""
 
