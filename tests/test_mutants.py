@@ -75,7 +75,7 @@ class Copies:
                 "FootprintModel.footprint",
                 "FootprintModel.alphas",
                 *(f"GaussianFalloff.{name}" for name in FALLOFF_DERIVATIVES),
-                "PixelCenters.gaussian_moments",
+                *(f"PixelCenters.{name}" for name in ("sum", "sum_dx", "sum_dy", "sum_dy_dy")),
                 *(f"SplatFeatures.{name}" for name in ("add_derivatives", "tangents")),
             ],
             forward=["FootprintModel.footprint", "FootprintModel.alphas"],

@@ -45,7 +45,6 @@ extends around the camera, and its outline is unbounded.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -277,8 +276,6 @@ class RayFalloff(GaussianFalloff):
             dy=affine.dy,
             u=affine.u,
             v=affine.v,
-            p=affine.p,
-            r=affine.r,
             log2_alpha=log2_alpha,
             along=along,
             exponent=exponent,
@@ -287,7 +284,7 @@ class RayFalloff(GaussianFalloff):
 
     @override
     def moments(
-        self, footprint: Footprint, weights: Iterable[Float], positions: SamplePositions
+        self, footprint: Footprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
         """Sum over the 16 pixels w = d loss / d ln(alpha) times each of these.
 
@@ -296,7 +293,7 @@ class RayFalloff(GaussianFalloff):
             df = 2 A^2 e . de - 2 A B da - B^2 dh
         """
         assert isinstance(footprint, RayFootprint), "made by self.footprint"
-        dx, dy, weights = footprint.dx, footprint.dy, list(weights)
+        dx, dy = footprint.dx, footprint.dy
         anchor_x, anchor_y = footprint.from_anchor
         x, y, z, bb = [], [], [], []
         for w, a, b, (u, v) in zip(

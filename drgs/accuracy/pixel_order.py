@@ -224,7 +224,7 @@ def _walk(
         geometry, features = records.load(entry, active)
         keys = records.load_keys(entry, active)
         footprint = model.footprint(geometry, lanes, active)
-        alphas = list(model.alphas(geometry, footprint, active))
+        alphas = list(model.alphas(geometry, footprint))
         met = _Crossing(place, entry, active, geometry, features, footprint, alphas)
         # Depth of a missing splat: before all others, so that it is visited at once and changes
         # nothing; after the last splat, behind them, so that it replaces them in the window.

@@ -165,7 +165,7 @@ def count_work(frame: rendering.Frame) -> Work:
         entry, active = entries.current(cursor)
         geometry, _ = frame.records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)
-        for pixel, alpha in enumerate(model.alphas(geometry, footprint, active)):
+        for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
             useful = useful + dr.select((alpha.value > 0) & (entry < ends[pixel]), t.UInt32(1), 0)
         return entries.advance(cursor), visited + dr.select(active, t.UInt32(1), 0), useful
 

@@ -72,10 +72,11 @@ def llvm_vector_width() -> int:
 
 @contextmanager
 def access_all_lanes(array_type: type[dr.ArrayBase]) -> Iterator[None]:
-    """Access memory in all lanes of the loop that is being traced, not in its active ones only.
+    """Access memory in all lanes of what is being traced.
 
-    For accesses that are valid in every lane and, where a lane is not active, change nothing: a
-    selection for each is saved. array_type: of the LLVM backend, or else nothing changes.
+    Also in those that a loop has left, and in those that only fill up the last vector of a launch.
+    Accesses must be valid there, and change nothing that is read; a selection or a branch for each
+    is saved. array_type: of the LLVM backend, or else nothing changes.
 
     Relies on Dr.Jit taking the mask of an access from the top of a stack.
     """

@@ -8,7 +8,6 @@ splats far out of focus are as opaque as in focus. Partial occlusion at blurred 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -107,7 +106,7 @@ class DimmedFalloff(GaussianFalloff):
 
     @override
     def moments(
-        self, footprint: Footprint, weights: Iterable[Float], positions: SamplePositions
+        self, footprint: Footprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
         return self.falloff.moments(footprint, weights, positions)
 

@@ -289,6 +289,10 @@ class LanePoints(SamplePositions):
     def sum_dy(self, values: list[Float], dy: list) -> Float:
         return total(_products(values, dy))
 
+    @override
+    def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
+        return total(_products(_products(values, dy), dy))
+
 
 def _products(values: list[Float], grid: list[list[Float]]) -> list[Float]:
     return [a * b for a, b in zip(values, flat_columns(grid), strict=True)]

@@ -13,10 +13,9 @@ the 3DGS paper; others are in separate modules, imported when they are chosen:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
 from typing import ClassVar
 
 import drjit as dr
@@ -117,22 +116,9 @@ class SamplePositions:
         """Sum values times dy."""
         raise NotImplementedError
 
-    def gaussian_moments(self, footprint: Footprint, weights: Iterable[Float]) -> list[Float]:
-        """Sum weights times 1, u, u dx, u dy, dy, dy^2."""
-        dx, dy, weights = footprint.dx, footprint.dy, list(weights)
-        z = [a * b for a, b in zip(weights, flat_columns(footprint.u), strict=True)]
-        w_dy = [a * b for a, b in zip(weights, flat_columns(dy), strict=True)]
-        return [
-            self.sum(weights),
-            self.sum(z),
-            self.sum_dx(z, dx),
-            self.sum_dy(z, dy),
-            self.sum(w_dy),
-            self.sum_dy(w_dy, dy),
-        ]
-
-
-CENTER = (MICRO - 1) / 2  # px, from the first pixel to the centre of a micro-tile
+    def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
+        """Sum values times dy^2."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -167,34 +153,9 @@ class PixelCenters(SamplePositions):
         return _dot(self._rows(values), _first_of_rows(dy))
 
     @override
-    def gaussian_moments(self, footprint: Footprint, weights: Iterable[Float]) -> list[Float]:
-        """Sum, row by row, weights times powers of the offsets h, k from the micro-tile's centre.
-
-        The moments follow from these sums. u at the centre is not much larger than at a pixel that
-        shows, so that nothing cancels.
-        """
-        pixels, zero = iter(weights), type(footprint.p)(0)
-        sums = [zero] * 6  # of w times 1, 2h, 4h^2, 2k, 4hk, 4k^2
-        for row in range(MICRO):
-            a, b, c, d = islice(pixels, MICRO)
-            outer, inner, k = a + d, b + c, 2 * row - 3
-            w, w_h, w_hh = outer + inner, dr.fma(3, d - a, c - b), dr.fma(9, outer, inner)
-            terms = [(1, w), (1, w_h), (1, w_hh), (k, w), (k, w_h), (k * k, w)]
-            sums = [dr.fma(factor, x, s) for (factor, x), s in zip(terms, sums, strict=True)]
-        w, w_h, w_hh, w_k, w_hk, w_kk = sums
-        w_h, w_k, w_hh, w_hk, w_kk = w_h / 2, w_k / 2, w_hh / 4, w_hk / 4, w_kk / 4
-        p, r = footprint.p, footprint.r
-        x, y = footprint.dx[0][0] + CENTER, footprint.dy[0][0] + CENTER
-        u = dr.fma(p, x, r * y)
-        w_u, w_dy = dr.fma(u, w, dr.fma(p, w_h, r * w_k)), dr.fma(y, w, w_k)
-        return [
-            w,
-            w_u,
-            dr.fma(x, w_u, dr.fma(u, w_h, dr.fma(p, w_hh, r * w_hk))),
-            dr.fma(y, w_u, dr.fma(u, w_k, dr.fma(p, w_hk, r * w_kk))),
-            w_dy,
-            dr.fma(y, w_dy + w_k, w_kk),
-        ]
+    def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
+        dy = _first_of_rows(dy)
+        return _dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
 
     @staticmethod
     def _rows(values: list[Float]) -> list[Float]:
@@ -237,8 +198,6 @@ class Footprint:
     dy: list  # grid, px
     u: list  # grid: first component of U d, scaled to base 2
     v: list  # grid: second component
-    p: Float  # U's first row, scaled to base 2
-    r: Float
     log2_alpha: list[Float]  # 16: unclamped
 
 
@@ -325,23 +284,22 @@ class GaussianFalloff:
             dr.fma(-a, a, dr.fma(-b, b, log2_opacity))
             for a, b in zip(flat_columns(u), flat_columns(v), strict=True)
         ]
-        return Footprint(dx=dx, dy=dy, u=u, v=v, p=p, r=r, log2_alpha=log2_alpha)
-
-    def alphas(
-        self, footprint: Footprint, floor: Float | float, alpha_max: float
-    ) -> Iterator[Alpha]:
-        """Yield alpha at the 16 pixels, row by row.
-
-        floor: the base-2 logarithm of the smallest alpha, NaN on lanes that are not active.
-        """
-        for log2_alpha in footprint.log2_alpha:
-            yield Alpha.from_log2(log2_alpha, floor, alpha_max)
+        return Footprint(dx=dx, dy=dy, u=u, v=v, log2_alpha=log2_alpha)
 
     def moments(
-        self, footprint: Footprint, weights: Iterable[Float], positions: SamplePositions
+        self, footprint: Footprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
         """Sums over the 16 pixels of w = d loss / d ln(alpha) times 1, u, u dx, u dy, dy, dy^2."""
-        return positions.gaussian_moments(footprint, weights)
+        dx, dy = footprint.dx, footprint.dy
+        z = [a * b for a, b in zip(weights, flat_columns(footprint.u), strict=True)]
+        return [
+            positions.sum(weights),
+            positions.sum(z),
+            positions.sum_dx(z, dx),
+            positions.sum_dy(z, dy),
+            positions.sum_dy(weights, dy),
+            positions.sum_dy_dy(weights, dy),
+        ]
 
     def derivatives(self, geometry: list[Float], totals: list[Float]) -> list[Float]:
         """Return the derivatives of mean x, y, p, r, s (unscaled), and opacity, from moments.
@@ -503,24 +461,26 @@ class FootprintModel:
     def bind(self, lanes: Lanes, grid: TileGrid) -> FootprintModel:
         """Return this model for the lanes of one kernel, with inputs loaded before the loop."""
         positions = self.positions.bind(lanes, grid)
-        return replace(self, positions=positions, features=self.features.bind(lanes, positions))
+        return FootprintModel(
+            falloff=self.falloff,
+            positions=positions,
+            features=self.features.bind(lanes, positions),
+            cutoffs=self.cutoffs,
+        )
 
     def footprint(self, geometry: list[Float], lanes: Lanes, active: Bool | bool) -> Footprint:
         """Evaluate a splat at the pixels of each lane."""
         return self.falloff.footprint(geometry, partial(self.positions.offsets, lanes), active)
 
-    def alphas(
-        self, geometry: list[Float], footprint: Footprint, active: Bool | bool
-    ) -> Iterator[Alpha]:
-        """Yield alpha at the 16 pixels, 0 on lanes that are not active.
+    def alphas(self, geometry: list[Float], footprint: Footprint) -> Iterator[Alpha]:
+        """Yield alpha at the 16 pixels.
 
-        Dr.Jit computes in the order of tracing: values of a pixel that is dealt with at once stay
-        in registers.
+        One by one, because Dr.Jit computes in the order of tracing: the values of a pixel that is
+        composited at once stay in registers.
         """
         floor = self.falloff.log2_floor(geometry, self.cutoffs)
-        # A comparison with NaN fails, also that of a product that overflows there.
-        floor = dr.select(active, floor, type(geometry[0])(math.nan))
-        return self.falloff.alphas(footprint, floor, self.cutoffs.alpha_max)
+        for log2_alpha in footprint.log2_alpha:
+            yield Alpha.from_log2(log2_alpha, floor, self.cutoffs.alpha_max)
 
 
 DEFAULT = FootprintModel()

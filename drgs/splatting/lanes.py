@@ -121,7 +121,7 @@ class Entries:
 
     def __init__(self, bins: TileBins, lanes: Lanes, end: UInt32) -> None:
         UInt32 = type(lanes.tile)
-        self.words, self.micro, self.sample, self.end = bins.words, lanes.micro, lanes.sample, end
+        self.words, self.micro, self.sample = bins.words, lanes.micro, lanes.sample
         start = dr.gather(UInt32, bins.tile_start, lanes.tile)
         occupied = start < end
         # An empty lane gets first == last and no bits: it is over before it begins.
@@ -146,12 +146,6 @@ class Entries:
         Where there is none, it is one of the entries of the cursor's group.
         """
         return cursor.group * WORD + find_lowest_bit(cursor.word), cursor.word != 0
-
-    def end_of(self, cursor: Cursor) -> UInt32:
-        """Return an index behind the current entry and those before it, not behind later ones."""
-        entry, active = self.current(cursor)
-        behind = dr.select(active, entry, cursor.group * WORD + (WORD - 1)) + 1
-        return dr.minimum(behind, self.end)
 
     def advance(self, cursor: Cursor) -> Cursor:
         """Drop the current entry; open the next group when this one is used up."""
@@ -215,7 +209,7 @@ def count_entries(entries: Entries) -> UInt32:
 def find_lowest_bit(word: UInt32) -> UInt32:
     """Return the index of the lowest bit that is set, by the exponent of a floating point number.
 
-    AVX2 has no instruction for it. Of no bit: any number below 32.
+    AVX2 has no instruction for it. Of no bit: 1.
     """
     return _exponent(_to_float(word & (0 - word))) & (WORD - 1)
 
@@ -231,7 +225,7 @@ def _to_float(word: UInt32) -> Float:
 
 
 def _exponent(value: Float) -> UInt32:
-    """Return the exponent, above it the sign."""
+    """Return the exponent; of negative numbers, 32 is to be divided out."""
     return (reinterpret(dr.uint32_array_t(type(value)), value) >> 23) - 127
 
 

@@ -42,7 +42,7 @@ and writes them into the slot of this (splat, micro-tile) pair: see
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import reduce
 from operator import and_
@@ -156,7 +156,7 @@ class Records:
         return numbers[: self.num_geometry], numbers[self.num_geometry :][: self.num_features]
 
     def load_anywhere(self, entry: UInt32, active: Bool) -> tuple[list[Float], list[Float]]:
-        """Return the same, with the geometry of any splat on lanes that are not active."""
+        """Return the same; on lanes that are not active, any splat's geometry, and features 0."""
         geometry, features = self.load(entry, True)
         return geometry, [dr.select(active, number, 0) for number in features]
 
@@ -194,21 +194,21 @@ def composite(bins: TileBins, records: Records) -> Layers:
         cursor: Cursor, values: dr.Local[Float], ends: dr.Local[UInt32], unfinished: Bool
     ) -> tuple:
         entry, active = entries.current(cursor)
-        behind = entries.end_of(cursor)
+        active &= unfinished
         cursor = entries.advance(cursor)
         signs: Int32 | int = -1
         # On a lane that is not active, alpha is zero and nothing changes.
         with access_all_lanes(t.Float):
             geometry, features = records.load_anywhere(entry, active)
             footprint = model.footprint(geometry, lanes, active)
-            for pixel, alpha in enumerate(model.alphas(geometry, footprint, active)):
+            for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
                 T, *C = (values[planes * pixel + k] for k in range(planes))
                 weight, T, goes_on = composite_step(T, alpha.value, stop)
                 signs &= sign_bits(T)
                 C = model.features.add(C, features, pixel, weight)
                 for k, value in enumerate([T, *C]):
                     values[planes * pixel + k] = value
-                ends[pixel] = dr.select(goes_on, behind, ends[pixel])
+                ends[pixel] = dr.select(goes_on & active, entry + 1, ends[pixel])
         return cursor, values, ends, signs >= 0
 
     _, values, ends, _ = dr.while_loop(
@@ -257,6 +257,8 @@ def largest(values: list[UInt32]) -> UInt32:
 # ----------------------------------------------------------------------------------------------
 # Adjoint
 # ----------------------------------------------------------------------------------------------
+
+SPARE_ROWS = 64  # behind the slots, for sums of lanes without a splat
 
 ONE_SAMPLE = range(1)  # samples of layers that have one
 
@@ -337,10 +339,11 @@ def _partials(
     g = [load_pixels(plane, lanes, bins.grid) for plane in d_features]
     ends = [reinterpret(t.Int32, x) for x in load_lane_row(layers.ends, lanes.micro_tile, 1)]
     transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
-    partials = Rows.empty(t.Float, bins.num_sums, slots.band.num_slots + 1)
-
-    last_slot = dr.opaque(t.UInt32, slots.band.num_slots)
+    partials = Rows.empty(t.Float, bins.num_sums, slots.band.num_slots + SPARE_ROWS)
     behind = load_pixels(d_transmittance, lanes, bins.grid)
+    # Of their own for each part of a launch: threads would wait for each other's writes.
+    part = dr.arange(t.UInt32, dr.width(lanes.tile)) // MICROS % SPARE_ROWS
+    spare = dr.opaque(t.UInt32, slots.band.num_slots) + part
 
     def body(cursor: Cursor, slot: UInt32, pixels: dr.Local[Float]) -> tuple:
         entry, active = entries.current(cursor)
@@ -350,21 +353,13 @@ def _partials(
         with access_all_lanes(t.Float):
             geometry, features = records.load_anywhere(entry, active)
             footprint = model.footprint(geometry, lanes, active)
-            d_features = [t.Float(0) for _ in features]
             # Comparing unsigned numbers takes more instructions.
-            composited = (reinterpret(t.Int32, entry) < end for end in ends)
-            alphas = model.alphas(geometry, footprint, active)
-            d_log_alphas = _adjoint_step(
-                zip(alphas, composited, strict=True),
-                features,
-                model.features,
-                pixels,
-                g,
-                d_features,
-            )
-            moments = model.falloff.moments(footprint, d_log_alphas, model.positions)
+            composited = [reinterpret(t.Int32, entry) < end for end in ends]
+            alphas = zip(model.alphas(geometry, footprint), composited, strict=True)
+            d_log_alpha, d_features = _adjoint_step(alphas, features, model.features, pixels, g)
+            moments = model.falloff.moments(footprint, d_log_alpha, model.positions)
             # All lanes store: with a mask, each has a branch.
-            partials.store(moments + d_features, dr.select(active, slot, last_slot))
+            partials.store(moments + d_features, dr.select(active, slot, spare))
         return cursor, slot, pixels
 
     loop = dr.while_loop(
@@ -386,27 +381,27 @@ def _adjoint_step(
     features: SplatFeatures,
     pixels: dr.Local[Float],
     g: list[list[Float]],
-    d_stored: list[Float],
-) -> Iterator[Float]:
-    """Yield d loss / d ln(alpha) of a splat at 16 pixels.
+) -> tuple[list[Float], list[Float]]:
+    """Return d loss / d ln(alpha) of a splat at 16 pixels, and d loss / d stored.
 
     alphas: with whether each pixel was unfinished; stored: the splat's stored numbers; features:
     their values at a pixel; pixels: T and b of each, behind the splat, replaced by those before it;
-    g: [plane][pixel] derivative of the loss with respect to C; d_stored: derivatives of the stored
-    numbers, to which the pixels' are added.
+    g: [plane][pixel] derivative of the loss with respect to C.
     """
+    d_log_alpha, d_stored = [], [type(number)(0) for number in stored]
     for pixel, (alpha, composited) in enumerate(alphas):
         T, behind = pixels[2 * pixel], pixels[2 * pixel + 1]
         value = dr.select(composited, alpha.value, 0)
         T = T / (1 - value)
         weight = value * T
         g_pixel = [plane[pixel] for plane in g]
-        d_stored[:] = features.add_derivatives(d_stored, stored, pixel, weight, g_pixel)
+        d_stored = features.add_derivatives(d_stored, stored, pixel, weight, g_pixel)
         gain = features.feature_gradient(stored, pixel, g_pixel) - behind
         pixels[2 * pixel] = T
         pixels[2 * pixel + 1] = dr.fma(value, gain, behind)
         # d loss / d ln(alpha) = a T (c.g - b), zero where alpha is clamped.
-        yield dr.select(alpha.smooth, weight * gain, 0)
+        d_log_alpha.append(dr.select(alpha.smooth, weight * gain, 0))
+    return d_log_alpha, d_stored
 
 
 def splat_gradients(
@@ -483,7 +478,7 @@ def composite_tangent(
         d_geometry, d_features = d_records.load(entry, active)
         d_log_alpha = model.falloff.tangent(geometry, footprint, d_geometry)
         T, dT, dC = list(T), list(dT), [list(c) for c in dC]
-        for pixel, alpha in enumerate(model.alphas(geometry, footprint, active)):
+        for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
             before, d_before = dr.abs(T[pixel]), dT[pixel]
             weight, T[pixel], goes_on = composite_step(T[pixel], alpha.value, stop)
             d_alpha = dr.select(alpha.smooth, alpha.value * d_log_alpha[pixel], 0)

@@ -1,9 +1,9 @@
 """Reduction of partial derivatives in a fixed order, without atomic additions.
 
 In the adjoint of compositing, a lane sums the partial derivatives of a splat over 16 pixels. Each
-composited (entry, micro-tile) pair has a *slot*, which only this lane writes. Then one lane per
-entry adds the entry's slots, and one lane per splat its entries. The result is the same to the last
-bit in every run.
+composited (entry, micro-tile) pair has a *slot*, which only this lane writes. (Lanes without a pair
+write behind the slots, which nobody reads.) Then one lane per entry adds the entry's slots, and one
+lane per splat its entries. The result is the same to the last bit in every run.
 
 To save memory, the image is divided into *bands* of tiles, and only the slots of one band exist at
 a time.
@@ -202,6 +202,7 @@ def sum_entries(
     entry = dr.opaque(t.UInt32, slots.band.entries.start) + dr.arange(t.UInt32, count)
     group, below = entry // WORD, (t.UInt32(1) << (entry % WORD)) - 1
     zero, micros = dr.zeros(t.Float, count), dr.gather(t.UInt32, pairs.masks, entry)
+    # Lanes that only fill up a vector read what exists.
     group = dr.select(micros != 0, group, slots.first_group)
     spare = dr.opaque(t.UInt32, slots.band.num_slots)
 
@@ -209,7 +210,7 @@ def sum_entries(
         for _ in range(2):  # two at a time wait for memory together
             active = micros != 0
             with access_all_lanes(t.Float):
-                first, word = slots.locate(group, find_lowest_bit(micros) % MICROS)
+                first, word = slots.locate(group, find_lowest_bit(micros))
                 slot = dr.select(active, first + dr.popcnt(word & below), spare)
                 numbers = partials.load(slot)
             totals = [a + dr.select(active, b, 0) for a, b in zip(totals, numbers, strict=True)]

@@ -11,7 +11,7 @@ one value, the number of entries.
 3. For each entry: its tile, and the exact ellipse-rectangle test of its micro-tiles.
 4. Stable sort of the entries by tile; within a tile they remain front to back.
 5. Transpose the bits: for each group of 32 entries and each micro-tile one 32-bit word, so that
-   compositing finds a micro-tile's next splat by counting trailing zeros.
+   compositing finds a micro-tile's next splat as the lowest bit.
 """
 
 from __future__ import annotations

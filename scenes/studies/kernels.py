@@ -169,6 +169,11 @@ ACCESSES = (
 )
 """Lines that move bytes, of each lane of a vector."""
 
+VARIABLE = re.compile(r"(%\w+) = getelementptr .*ptr %arr_\d+,")
+"""A line that names the place of a lane's variable, which is in a register or on the stack."""
+
+POINTER = re.compile(r"ptr (%\w+)")
+
 LOOP = re.compile(r"^l_(?P<number>\d+)_(?P<part>cond|done):")
 
 
@@ -183,17 +188,20 @@ class Accesses:
 def accesses_of(ir: str) -> Accesses:
     """Read the intermediate representation of a kernel of Dr.Jit's LLVM backend."""
     once, loops, inside = 0, [], []
-    for line in ir.partition("\n}")[0].splitlines():  # helpers that it calls follow
+    kernel = ir.partition("\n}")[0]  # helpers that it calls follow
+    variables = set(VARIABLE.findall(kernel))
+    for line in kernel.splitlines():
         border = LOOP.match(line)
         if border and border["part"] == "cond":
             inside.append(len(loops))
             loops.append(0)
         elif border:
             inside.pop()
+        moved = 0 if variables.intersection(POINTER.findall(line)) else _bytes_of_line(line)
         if inside:
-            loops[inside[-1]] += _bytes_of_line(line)
+            loops[inside[-1]] += moved
         else:
-            once += _bytes_of_line(line)
+            once += moved
     return Accesses(once, tuple(loops))
 
 

@@ -38,7 +38,6 @@ class CompactFalloff(GaussianFalloff):
 
     def moments(self, footprint, weights, positions):
         """Sum d loss / d ln(alpha) over the pixels, and what it contributes to each derivative."""
-        weights = list(weights)
         scaled = [w * slope for w, slope in zip(weights, _slopes(footprint), strict=True)]
         return [positions.sum(weights), *super().moments(footprint, scaled, positions)[1:]]
 

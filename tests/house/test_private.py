@@ -66,6 +66,14 @@ def test_accesses_reach_all_lanes_or_those_of_the_loop():
     assert increment_in_a_loop(nullcontext()) == [0, 1, 2, 3]
 
 
+def test_accesses_reach_lanes_that_fill_up_a_vector():
+    index, memory = dr.arange(UInt32, 5), dr.zeros(UInt32, 64)
+    with private.access_all_lanes(UInt32):
+        dr.scatter(memory, UInt32(1), index)
+    width = private.llvm_vector_width()
+    assert list(memory) == [int(k < -(-5 // width) * width) for k in range(64)]
+
+
 def test_llvm_version_is_known():
     assert private.llvm_version()[0] > 10
 
