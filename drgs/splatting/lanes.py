@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import drjit as dr
 from typing_extensions import override
@@ -221,7 +221,8 @@ def _find_highest_bit(word: UInt32) -> UInt32:
 
 
 def _to_float(word: UInt32) -> Float:
-    return dr.float32_array_t(type(word))(reinterpret(dr.int32_array_t(type(word)), word))
+    Float32 = cast("type[Float]", dr.float32_array_t(type(word)))
+    return Float32(reinterpret(dr.int32_array_t(type(word)), word))
 
 
 def _exponent(value: Float) -> UInt32:
