@@ -328,19 +328,6 @@ def with_aligned_stack(value: Array) -> Array:
     return variable[dr.opaque(UInt32, 0)]
 
 
-def variables_of(values: Sequence[Array]) -> dr.Local[Array]:
-    """Allocate variables of each lane, in memory, with these values.
-
-    For numbers that a loop changes with :func:`drgs.core.private.access_all_lanes`, in lanes that
-    are not active to the values that they have. Of the numbers in a loop's state, Dr.Jit selects
-    the old or the new one.
-    """
-    variables = dr.alloc_local(type(values[0]), len(values))
-    for index, value in enumerate(values):
-        variables[index] = value
-    return variables
-
-
 def _dynamic_vector(columns: Sequence[Array]) -> dr.ArrayBase:
     return _dynamic_type(type(columns[0]))(columns)
 

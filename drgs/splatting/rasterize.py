@@ -31,6 +31,10 @@ pixel and splat, and the tests of the forward pass are repeated exactly.
 record is loaded once for 16 pixels. The lanes of a vector wait for the slowest, so lanes with
 similar numbers of splats are grouped.
 
+What changes in a pixel is kept in variables in memory that all lanes read and write. Dr.Jit would
+select the old or the new value of each number in a loop's state, as a lane may have left the loop;
+a lane without a splat computes alpha = 0 instead, which changes nothing.
+
 **Memory.** A cache miss takes as long as a lane's arithmetic. Lanes therefore access memory in
 order: splats are copied into the order of the entries, and a lane of the adjoint writes contiguous
 memory.
@@ -50,15 +54,7 @@ from typing import cast
 
 import drjit as dr
 
-from drgs.core.arrays import (
-    Rows,
-    divide,
-    quotient,
-    reinterpret,
-    scatter_rows,
-    types_of,
-    variables_of,
-)
+from drgs.core.arrays import Rows, divide, quotient, reinterpret, scatter_rows, types_of
 from drgs.core.private import access_all_lanes
 from drgs.core.types import Array2f, Bool, Float, Int32, UInt32
 from drgs.splatting.footprint import Alpha, SplatFeatures
@@ -341,6 +337,9 @@ def _partials(
     transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
     partials = Rows.empty(t.Float, bins.num_sums, slots.band.num_slots + SPARE_ROWS)
     behind = load_pixels(d_transmittance, lanes, bins.grid)
+    last = dr.alloc_local(t.Float, 2 * PIXELS)
+    for pixel in range(PIXELS):
+        last[2 * pixel], last[2 * pixel + 1] = transmittance[pixel], behind[pixel]
     # Of their own for each part of a launch: threads would wait for each other's writes.
     part = dr.arange(t.UInt32, dr.width(lanes.tile)) // MICROS % SPARE_ROWS
     spare = dr.opaque(t.UInt32, slots.band.num_slots) + part
@@ -366,7 +365,7 @@ def _partials(
         state=(
             entries.begin(),
             slots.end(entries),
-            variables_of([v for pixel in zip(transmittance, behind, strict=True) for v in pixel]),
+            last,
         ),
         cond=lambda cursor, slot, pixels: entries.pending(cursor),
         body=body,
