@@ -16,6 +16,7 @@ import json
 import math
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from drgs.cli.commands import (
     run_command,
 )
 from drgs.cli.execution import add_execution_arguments, execution_settings, select_variant
+from drgs.config.approximations import parse_error
 from drgs.config.schema import NAMED_COLORS, FitConfig
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.environment import VARIANTS
@@ -52,12 +54,19 @@ from drgs.io.images import (
     read_pixels,
     write_animation,
     write_exr,
-    write_png,
 )
 from drgs.io.scenes import load_scene_file
-from drgs.results.files import CAMERAS, CONFIG, METRICS, ORBIT, ORBIT_GIF
+from drgs.results.files import CAMERAS, CONFIG, ERROR_BUDGET, METRICS, ORBIT, ORBIT_GIF
 from drgs.results.metrics import Quality, mean_of, psnr, ssim
-from drgs.results.model import Background, ImageFolder, Model, Render, load_model, open_image_folder
+from drgs.results.model import (
+    BUDGET_KEY,
+    Background,
+    ImageFolder,
+    Model,
+    Render,
+    load_model,
+    open_image_folder,
+)
 from drgs.results.refined_cameras import training_cameras
 
 DEFAULT_SIZE = (400, 400)  # px, where nothing else decides how large an image is
@@ -163,6 +172,7 @@ def _add_cameras(parser: CommandParser) -> None:
 def _add_settings(parser: CommandParser) -> None:
     group = parser.add_argument_group("rendering")
     add_background(group)
+    add_error(group)
     group.add_argument(
         "--ignore",
         nargs="+",
@@ -196,6 +206,17 @@ def add_background(parser: argparse._ActionsContainer) -> None:
     )
 
 
+def add_error(parser: argparse._ActionsContainer) -> None:
+    """Add the argument of an error budget."""
+    parser.add_argument(
+        "--error",
+        type=error_budget,
+        metavar="ERROR",
+        help="largest error of the approximations, which are then chosen by measurement: root mean "
+        'square in 0..1, "54dB" or "0.5steps" (of 8 bits)',
+    )
+
+
 def run(args: argparse.Namespace) -> None:
     """Render the images of the command line."""
     if process_number() is None:
@@ -213,13 +234,13 @@ def run_with_arguments(args: argparse.Namespace, render: Render) -> None:
         _check(args)
         select_variant(args.variant)
         if args.what.suffix.lower() == ".xml":
-            render_mitsuba_scene(args.what, folder, dict(args.define or ()))
+            render_mitsuba_scene(args.what, folder, dict(args.define or ()), args.error)
         else:
             data = [] if args.data is None else [f"data.path={args.data}"]
             overrides, background = [*(args.set or ()), *data], parse_background(args.background)
             effects = args.ignore or ()
             model = load_model(args.what, args.scene, overrides, background, effects, render)
-            render_model(args, model, folder)
+            render_model(args, replace(model, error=args.error), folder)
         print(f"written: {args.out}")
 
 
@@ -234,6 +255,7 @@ def render_model(args: argparse.Namespace, model: Model, folder: ImageFolder) ->
             pass
     else:
         render_split(model, args.split or "test", folder)
+    folder.write_budget()
 
 
 def render_split(model: Model, split: str, folder: ImageFolder) -> Quality:
@@ -246,7 +268,7 @@ def render_split(model: Model, split: str, folder: ImageFolder) -> Quality:
     print(f"{'view':{column}}  PSNR [dB]    SSIM")
     scores = []
     for view, image in zip(views, images, strict=True):
-        write_png(folder.path / f"{view.name}.png", image)
+        folder.write_png(f"{view.name}.png", image)
         pair = image, view.image, view.mask
         scores.append({"psnr": psnr(*pair), "ssim": ssim(*pair)})
         print(f"{view.name:{column}}  {_line(**scores[-1])}", flush=True)
@@ -299,7 +321,7 @@ def render_cameras(
     """Write and yield images without photographs; others: further files to be written."""
     images = model.images(viewpoints, folder, others, "give a smaller --size")
     for camera, image in zip(viewpoints, images, strict=True):
-        write_png(folder.path / f"{camera.name}.png", image)
+        folder.write_png(f"{camera.name}.png", image)
         print(f"{camera.name}: {camera.width}x{camera.height}", flush=True)
         yield image
 
@@ -317,10 +339,12 @@ def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
     return [view.with_offset(-np.array(origin)) for view in views]
 
 
-def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str, str]) -> None:
+def render_mitsuba_scene(
+    path: Path, folder: ImageFolder, definitions: dict[str, str], error: float | None = None
+) -> None:
     """Render every sensor of a Mitsuba scene to EXR (all channels) and PNG (colours in sRGB).
 
-    definitions: values for the parameters ($name) of the scene file.
+    definitions: values for the parameters ($name) of the scene file; error: the error budget.
     """
     try:
         scene = load_scene_file(path, **definitions)
@@ -328,12 +352,20 @@ def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str,
         raise UserError(f"{path}: {reason_of_mitsuba(error)}") from None
     if not isinstance(scene, mi.Scene) or scene.integrator() is None or not scene.sensors():
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
+    if error is not None:
+        if not is_splats(scene.integrator()):
+            raise UserError("--error: the scene's own integrator must be splats")
+        scene.integrator().error = error
     stem, count = shorten_stem(path.stem), len(scene.sensors())
     names = [stem] if count == 1 else [f"{stem}_{index}" for index in range(count)]
     files = [f"{name}.{suffix}" for name in names for suffix in ("exr", "png")]
+    files += [ERROR_BUDGET] if error is not None else []
     bitmaps = folder.claim(files, _render_sensors(path, scene))
     for name, bitmap in zip(names, bitmaps, strict=True):
         width, height = bitmap.size()
+        if error is not None:
+            folder.budget[:] = [scene.integrator().budget_report]
+            bitmap.metadata()[BUDGET_KEY] = json.dumps(folder.budget[0].record())
         write_exr(folder.path / f"{name}.exr", bitmap)
         # As floats: Mitsuba's own conversion to 8 bits rounds down.
         colors = bitmap.split()[0][1].convert(
@@ -342,8 +374,9 @@ def render_mitsuba_scene(path: Path, folder: ImageFolder, definitions: dict[str,
             srgb_gamma=_is_linear(scene.integrator()),
         )
         # NaN in a scene's light is black in the PNG, and kept in the EXR.
-        write_png(folder.path / f"{name}.png", np.nan_to_num(np.array(colors)))
+        folder.write_png(f"{name}.png", np.nan_to_num(np.array(colors)))
         print(f"{name}: {width}x{height}")
+    folder.write_budget()
 
 
 def _is_linear(integrator: mi.Integrator) -> bool:
@@ -358,6 +391,8 @@ def _render_sensors(path: Path, scene: mi.Scene) -> Iterator[mi.Bitmap]:
     try:
         if is_splats(integrator):
             print(integrator.summary(scene, *sensors), flush=True)
+            if integrator.budget_report is not None:
+                print(integrator.budget_report.line(), flush=True)
         for index, sensor in enumerate(sensors):
             integrator.render(scene, sensor=index)
             yield sensor.film().bitmap()
@@ -456,6 +491,14 @@ def parse_background(words: Sequence[str] | None) -> Background | None:
             + one_line(" ".join(words), 60)
         )
     return color
+
+
+def error_budget(text: str) -> float:
+    """Parse an error budget: see :func:`drgs.config.approximations.parse_error`."""
+    try:
+        return parse_error(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _line(psnr: float, ssim: float) -> str:

@@ -28,7 +28,7 @@ from drgs.core.errors import UserError
 from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.datasets.types import Viewpoint
 from drgs.datasets.viewpoints import FIELD_OF_VIEW
-from drgs.render import UP, add_background, parse_background
+from drgs.render import UP, add_background, add_error, parse_background
 from drgs.results.model import Background, Model, load_model
 from drgs.results.refined_cameras import training_cameras
 from drgs.viewer.frames import LiveScene
@@ -56,6 +56,7 @@ def add_arguments(parser: CommandParser) -> None:
         help="file of Gaussians, or output folder of a fit (default: a crane truck)",
     )
     add_background(parser)
+    add_error(parser)
     parser.add_argument(
         "--up",
         type=finite_number,
@@ -90,6 +91,8 @@ def run(args: argparse.Namespace) -> None:
         select_variant(args.variant)
         model = load_model(args.what, background=background_of(args))
         views = cameras_of(args, model)
+        if args.error is not None:
+            model = model.within_error(args.error, views)
         scene = LiveScene(model.gaussians, model.settings, model.background)
         requests, start = RenderRequests(), start_of(args, model, views)
         options = ("--address", "--port")

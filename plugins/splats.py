@@ -127,6 +127,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - |string|
        - Effects that are not simulated: a list of ``distortion``, ``defocus``, ``motion`` and
          ``smoothing``. (Default: none)
+     * - error
+       - |float| or |string|
+       - Largest root mean square error of an image in display space, from 0.00002 to below 1, also
+         as "54 dB" or "0.5 steps" (of 8 bits). The cheapest approximations within it are found at
+         the first rendering, on windows of a few of the scene's sensors; they replace those below
+         except for filters, falloff, ``alpha_max`` and ``extent``. (Default: none)
      * - projection, falloff, order, order_window, sh_direction, alpha_max, alpha_cut,
          transmittance_stop, extent, low_pass, antialiased
        - |string|, |int|, |float| or |bool|
@@ -215,6 +221,16 @@ class SplatsIntegrator(mi.CppADIntegrator):
         own = self.state.own
         own.gaussians = replace(own.gaussians, smoothing=filter_)
 
+    @property
+    def error(self) -> float | None:
+        """Error budget, 0..1. May be set: the next rendering chooses approximations for it."""
+        return self.state.error
+
+    @error.setter
+    def error(self, budget: float | None) -> None:
+        self.state.error, self.state.budget_report = budget, None
+
+    budget_report = property(attrgetter("state.budget_report"), doc="What ``error`` has chosen.")
     gaussians = property(attrgetter("state.gaussians"), doc="All rendered Gaussians, world space.")
     pipeline = property(attrgetter("state.pipeline"), doc="Stages that the settings select.")
     srgb_primitives = property(attrgetter("state.srgb_primitives"), doc="If images are linear.")
@@ -347,6 +363,13 @@ class SplatsIntegrator(mi.CppADIntegrator):
             from drgs.integrator.shadows import shade
 
             shade(self.state, scene)
+        if self.state.error is not None and self.state.budget_report is None:
+            from drgs.integrator.error_budget import meet_error_budget
+
+            sensors = scene.sensors() or [self.state.cache.sensor]
+            report = meet_error_budget(self.state, sensors, self.state.error)
+            self.state.budget_report = report
+            mi.Log(mi.LogLevel.Info, report.line())
 
     def _check_derivatives(self, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode) -> None:
         if surfaces_in(scene):

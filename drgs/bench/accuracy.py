@@ -20,6 +20,7 @@ import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
 
+from drgs.accuracy.error_budget import choose
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.bench.output import add_out, machine, markdown_table, write_rows
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
@@ -37,6 +38,7 @@ from drgs.integrator.film import SamplePoints
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
+from drgs.render import add_error
 from drgs.results import metrics
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS
 from drgs.splatting import rendering
@@ -134,6 +136,7 @@ def add_arguments(parser: CommandParser) -> None:
     add_out(parser, run, "accuracy.csv", *PLOTS)
     add_scene(parser)
     parser.add_argument("--views", type=int, default=3, help="test views of a fit (default: 3)")
+    add_error(parser)
     parser.add_argument("--quick", action="store_true", help="one view, fewer rounds")
 
 
@@ -168,9 +171,22 @@ def run(args: argparse.Namespace) -> None:
         found = measure(subject, accurate, RUNGS, QUICK_ROUNDS if args.quick else ROUNDS)
         results += found
         print(table(found), flush=True)
+        if args.error is not None:
+            print(f"\n{chosen_within(subject, args.error)}", flush=True)
     write_rows(args.out / "accuracy.csv", AccuracyMeasurement, results)
     for subject, name in zip(subjects, PLOTS, strict=True):
         write_figure(args.out / name, plot([m for m in results if m.scene == subject.name]))
+
+
+def chosen_within(subject: Subject, error: float) -> str:
+    """Return what an error budget chooses for the subject's views, or why there is no choice."""
+    cameras = [device_camera(camera, llvm.Float) for camera in subject.cameras]
+    gaussians = subject.gaussians.to(llvm.TensorXf)
+    degree, background = gaussians.sh_degree, subject.background
+    try:
+        return choose(gaussians, cameras, Approximations(), degree, background, error).line()
+    except ValueError as refusal:
+        return f"error {refusal}"
 
 
 def load_subject(path: Path, num_views: int) -> Subject:

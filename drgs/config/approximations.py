@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from typing import TypeVar
 
@@ -246,3 +247,33 @@ def from_ply_header(where: str, values: Mapping[str, Value]) -> dict[str, Value]
             )
         found[name] = value
     return found
+
+
+MIN_ERROR = 2e-5
+"""Smallest error budget: errors of single precision, which the tests bound."""
+
+ERROR_UNITS: dict[str, Callable[[float], float]] = {
+    "dB": lambda psnr: 10 ** (-psnr / 20),
+    "steps": lambda steps: steps / 255,
+    "step": lambda steps: steps / 255,
+    "": lambda error: error,
+}
+
+
+def parse_error(value: object) -> float:
+    """Return an error budget in 0..1 from a number, "54 dB" (PSNR) or "0.5 steps" (of 8 bits).
+
+    Raises ValueError for anything else, and for errors beyond the limits.
+    """
+    text = str(value).strip()
+    unit = next(unit for unit in ERROR_UNITS if text.endswith(unit))
+    error = math.nan
+    with suppress(ValueError, OverflowError):
+        error = ERROR_UNITS[unit](float(text.removesuffix(unit)))
+    if MIN_ERROR <= error < 1:
+        return error
+    converted = f", which is {error:.2g}" if unit and not math.isnan(error) else ""
+    raise ValueError(
+        f"must be a number from {MIN_ERROR:f}, which single precision allows, to below 1, or as in "
+        f'"54 dB" or "0.5 steps" (of 8 bits), got {one_line(text, 60) or "nothing"}{converted}'
+    )

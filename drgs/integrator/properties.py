@@ -16,7 +16,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.config.approximations import DECLARED, Approximations, Value, from_ply_header
+from drgs.config.approximations import (
+    DECLARED,
+    Approximations,
+    Value,
+    from_ply_header,
+    parse_error,
+)
 from drgs.core.constants import MAX_INT, NEAR
 from drgs.core.errors import PluginError, PluginTypeError, UserNote, did_you_mean
 from drgs.core.origin import WORLD, format_origin
@@ -133,7 +139,17 @@ OBJECT_PROPERTIES = ("filename", "to_world", "smoothing", *PARAMETER_NAMES)
 """Properties of a ``splats`` that is nested in another, besides :data:`FEATURE`."""
 
 KNOWN = (
-    *("filename", "to_world", SHAPES_TO_WORLD, "background", "probes", "shadows", "aovs", "ignore"),
+    *(
+        "filename",
+        "to_world",
+        SHAPES_TO_WORLD,
+        "background",
+        "probes",
+        "shadows",
+        "aovs",
+        "ignore",
+        "error",
+    ),
     *("smoothing", *SETTINGS, *APPROXIMATIONS, *PARAMETER_NAMES),
 )
 """Properties of ``splats``, besides nested objects and names with a prefix."""
@@ -174,6 +190,7 @@ def read_state(
         approximations=Approximations(**{**header, **read(props, given)}),
         header=header,
         aovs=_aovs(props, [*AOVS, *feature_widths(every)]),
+        error=_error(props),
         ignore=_words(props, "ignore"),
         probes=_words(props, "probes"),
         shadows=_words(props, "shadows"),
@@ -201,6 +218,16 @@ def _check_settings(state: SplatsState) -> None:
             raise PluginError(
                 f"splats: ignore must be a list of {', '.join(IGNORABLE)}, got {word!r}"
             )
+
+
+def _error(props: mi.Properties) -> float | None:
+    """Return the error budget; a number, or text with a unit."""
+    if "error" not in props:
+        return None
+    try:
+        return parse_error(props["error"])
+    except ValueError as error:
+        raise PluginError(f"splats: error {error}") from None
 
 
 def _words(props: mi.Properties, name: str) -> tuple[str, ...]:

@@ -139,6 +139,8 @@ class SplatsState:
     unseen: str
     shadows: Sequence[str]
     exposure: float
+    error: float | None  # budget of the approximations' error; None: as they are given
+    budget_report: Any = None  # drgs.accuracy.error_budget.BudgetReport, once it was met
     cache: RenderCache = field(default_factory=RenderCache)
     projection: rendering.ProjectionStage = field(default_factory=rendering.Projected)
 

@@ -8,7 +8,7 @@ EXR. Images are (H, W, C) in display space, rounded to 8 bits and clamped to [0,
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import imageio.v3 as iio
 import numpy as np
-from PIL import ExifTags, Image, ImageCms, ImageFile, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageCms, ImageFile, PngImagePlugin, UnidentifiedImageError
 
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, open_regular
@@ -254,9 +254,17 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
     return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Write one image: (H, W, 3) or, with straight alpha, (H, W, 4), in 0..1 or uint8."""
-    _write(path, encode(image, "png"))
+def write_png(path: Path, image: np.ndarray, text: Mapping[str, str] | None = None) -> None:
+    """Write one image: (H, W, 3) or, with straight alpha, (H, W, 4), in 0..1 or uint8.
+
+    text: to be stored with it, by name.
+    """
+    options = {}
+    if text:
+        options["pnginfo"] = chunks = PngImagePlugin.PngInfo()
+        for name, words in text.items():
+            chunks.add_text(name, words)
+    _write(path, encode(image, "png", **options))
 
 
 def write_exr(path: Path, bitmap: mi.Bitmap) -> None:

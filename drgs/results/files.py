@@ -22,6 +22,7 @@ BUDGET_PLAN = "plan.txt"  # the plan for a budget of time, with reasons
 TENSORBOARD = "tensorboard"  # a folder, with ``--tensorboard``
 EVENTS = f"{TENSORBOARD}/events.out.tfevents.fit"  # TensorBoard finds the word in the middle
 METRICS = "metrics.json"  # written last
+ERROR_BUDGET = "error_budget.json"  # of ``drgs render --error``
 
 RESULTS = (
     *(CAMERAS, CHECKPOINT, COLORS, CURVES, DENSITY, HISTORY, METRICS, ORBIT_GIF, ORBIT),

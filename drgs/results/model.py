@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import mitsuba as mi
 import numpy as np
@@ -16,19 +17,31 @@ from drgs.config.approximations import from_ply_header
 from drgs.config.changes import is_open
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
-from drgs.core.errors import UserError, format_names
+from drgs.core.errors import PluginError, UserError, format_names
+from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.orbits import near_plane_of
 from drgs.datasets.types import Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
-from drgs.integrator.scene import check_lenses, check_sizes, make_scene, render_views
+from drgs.integrator.scene import (
+    check_lenses,
+    check_sizes,
+    make_scene,
+    make_sensors,
+    render_views,
+)
+from drgs.integrator.state import SplatsState
 from drgs.integrator.summary import format_effects, summary_of_views
 from drgs.integrator.types import is_splats
-from drgs.results.files import CAMERAS, CONFIG, GAUSSIANS
+from drgs.io.images import write_png
+from drgs.results.files import CAMERAS, CONFIG, ERROR_BUDGET, GAUSSIANS
 from drgs.results.folder import relocate_data
 from drgs.results.refined_cameras import refined_dataset
+
+if TYPE_CHECKING:  # imported where there is an error budget
+    from drgs.accuracy.error_budget import BudgetReport
 
 Background = tuple[float, float, float] | Path  # display space, or an image file
 
@@ -36,6 +49,7 @@ Render = Callable[..., Iterator[np.ndarray]]
 """Yields images (H, W, 3) of a scene and views: ``render_views``, or several processes."""
 
 COMMAND = "render"
+BUDGET_KEY = "drgs error budget"  # of images' metadata
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr")
 
 Image = TypeVar("Image")
@@ -47,6 +61,18 @@ class ImageFolder:
 
     path: Path
     keep: Callable[[], object]  # see :func:`drgs.core.folders.sole_writer`
+    budget: list[BudgetReport] = field(default_factory=list)  # of the images: one, or none
+
+    def write_png(self, name: str, image: np.ndarray) -> None:
+        """Write a claimed image, with the approximations that an error budget has chosen."""
+        text = [(BUDGET_KEY, json.dumps(one.record())) for one in self.budget]
+        write_png(self.path / name, image, dict(text))
+
+    def write_budget(self) -> None:
+        """Write what an error budget has chosen, if there is one."""
+        for one in self.budget:
+            with atomic_path(self.path / ERROR_BUDGET) as temporary:
+                temporary.write_text(json.dumps(one.record(), indent=2) + "\n")
 
     def claim(self, names: Iterable[str], images: Iterable[Image]) -> Iterator[Image]:
         """Yield the images after claiming the files ``names``.
@@ -99,6 +125,7 @@ class Model:
     ignored: str = ""  # effects not simulated: see the plugin
     folder: Path | None = None  # of the file, with optional refined cameras
     from_header: Collection[str] = ()  # names of settings from the file's header
+    error: float | None = None  # budget of the approximations' error; None: as ``settings``
     render: Render = render_views
 
     def scene(self) -> mi.Scene:
@@ -122,7 +149,29 @@ class Model:
         summary = summary_of_views(integrator.state, views, self.from_header)
         print(format_effects(summary), flush=True)
         names = [*(f"{view.name}.png" for view in views), *others]
+        if self.error is not None:
+            folder.budget.append(self.meet_error_budget(integrator.state, views))
+            names.append(ERROR_BUDGET)
         return folder.claim(names, self.render(scene, views))
+
+    def meet_error_budget(self, splats: SplatsState, views: Sequence[Viewpoint]) -> BudgetReport:
+        """Set approximations within the error; print and return what was found."""
+        from drgs.integrator.error_budget import meet_error_budget
+
+        assert self.error is not None
+        try:
+            report = meet_error_budget(splats, make_sensors(views), self.error)
+        except PluginError as error:
+            raise UserError(f"--{str(error).removeprefix('splats: ')}") from None
+        print(report.line(), flush=True)
+        return report
+
+    def within_error(self, error: float, views: Sequence[Viewpoint]) -> Model:
+        """Return this with approximations within an error at the views; print what was found."""
+        integrator = self.scene().integrator()
+        assert is_splats(integrator), "scene() sets it"
+        report = replace(self, error=error).meet_error_budget(integrator.state, views)
+        return replace(self, settings=self.settings.model_copy(update=report.chosen.changes))
 
     def dataset(self, option: str) -> Dataset:
         """Return the photographs that ``option`` requires."""

@@ -1,0 +1,195 @@
+"""Approximations that an error budget chooses, against the float64 reference of exact images."""
+
+import json
+from dataclasses import replace
+
+import drjit.llvm.ad as llvm
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+from support.commands import assert_refused
+from support.render_command import run, sensor, write_scene
+from support.small_capture import pose_around
+from support.views import Scene
+
+from drgs import render
+from drgs.accuracy import error_budget as budgets
+from drgs.bench.scenes import device_camera, stress_scene
+from drgs.cameras.lens import LENSES
+from drgs.config.approximations import Approximations, parse_error
+from drgs.core.errors import PluginError
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.io.scenes import openexr_threads
+from drgs.reference import rays as reference_rays
+from drgs.reference import splatting as reference
+
+SIZE, BLACK = 48, (0.0, 0.0, 0.0)
+SCENE = Scene(count=300)
+SHIPPED = Approximations()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Gaussians seen through a wide lens, and cameras beside each other."""
+    gaussians, (camera,) = stress_scene(SIZE)
+    rng = np.random.default_rng(0)
+    moved = [replace(camera, center=rng.normal(0, 0.15, 3)) for _ in range(12)]
+    return gaussians, moved
+
+
+def choose(scene, budget, given=SHIPPED):
+    gaussians, cameras = scene
+    on_device = [device_camera(camera, llvm.Float) for camera in cameras[::2]]
+    return budgets.choose(gaussians.to(llvm.TensorXf), on_device, given, 3, BLACK, budget)
+
+
+def image(scene, camera, approximations):
+    renderer = budgets.Renderer(scene[0].to(llvm.TensorXf), approximations, 3, BLACK)
+    return renderer.image(device_camera(camera, llvm.Float))
+
+
+@pytest.fixture(scope="module")
+def exact_images(scene):
+    """Float64 images of the views at which nothing is measured."""
+    gaussians, cameras = scene
+    of_numpy = reference.Gaussians(*(getattr(gaussians, name) for name in PARAMETER_NAMES))
+    model = reference_rays.ImageModel(
+        projection="exact",
+        order="pixel",
+        sh_direction="pixel",
+        alpha_cut=1e-6,
+        transmittance_stop=0.0,
+    )
+    return [reference_rays.render(of_numpy, one, BLACK, model).image for one in cameras[1::2]]
+
+
+@pytest.mark.parametrize("budget", [0.05, 0.02, 0.01])
+def test_other_views_are_within_the_budget_of_exact_images(scene, exact_images, budget):
+    chosen = choose(scene, budget).chosen.approximations
+    for camera, expected in zip(scene[1][1::2], exact_images, strict=True):
+        error = np.sqrt(np.mean((image(scene, camera, chosen) - expected) ** 2))
+        assert error < budget
+    default = np.sqrt(np.mean((image(scene, camera, Approximations()) - expected) ** 2))
+    assert default > 0.02, "a scene on which the smaller budgets take something"
+
+
+def test_smaller_budgets_cost_more_and_the_choice_is_the_same_in_every_run(scene):
+    reports = [choose(scene, budget) for budget in (0.05, 0.02, 0.01)]
+    costs = [report.chosen.cost for report in reports]
+    assert costs == sorted(costs)
+    assert costs[0] < costs[-1]
+    again = choose(scene, 0.02)
+    assert again.chosen == reports[1].chosen
+    assert again.errors == reports[1].errors
+    for report in reports:
+        assert report.faster is None or report.faster.error > report.chosen.error
+        assert report.better is None or report.better.error < report.chosen.error
+
+
+def test_filters_and_other_settings_are_kept(scene):
+    given = Approximations(low_pass=0.1, antialiased=True, alpha_max=0.9, extent=4.0)
+    chosen = choose(scene, 0.05, given).chosen
+    assert replace(chosen.approximations, **{k: getattr(given, k) for k in chosen.changes}) == given
+
+
+def test_windows_show_a_part_of_the_image(scene):
+    gaussians, (camera, *_) = scene
+    lens = LENSES.get("opencv").value.from_coefficients(k1=0.1, k2=0.01, p1=0.0, p2=0.0)
+    renderer = budgets.Renderer(gaussians.to(llvm.TensorXf), Approximations(), 3, (1, 0.5, 0))
+    whole = device_camera(camera, llvm.Float).with_lens(lens)
+    part = renderer.image(budgets.crop(whole, 12, 7, 20, 16))
+    np.testing.assert_allclose(part, renderer.image(whole)[7:23, 12:32], atol=2e-5)
+
+
+def test_a_bound_holds_for_most_views_of_the_same_kind():
+    """Of log-normal errors with the typical spread, as the words promise."""
+    rng = np.random.default_rng(0)
+    errors = np.exp(rng.normal(-6, budgets.TYPICAL_SPREAD, (4000, 5)))
+    within = [view <= budgets.bound(measured) for *measured, view in errors]
+    assert 0.93 < np.mean(within) < 0.98
+
+
+UNITS = [(0.002, 0.002), ("0.002", 0.002), ("54 dB", 10**-2.7), ("54dB", 10**-2.7)]
+UNITS += [("0.5 steps", 0.5 / 255), ("1step", 1 / 255), (" 2e-5 ", 2e-5)]
+
+
+@pytest.mark.parametrize(("given", "error"), UNITS)
+def test_budgets_have_units(given, error):
+    assert parse_error(given) == pytest.approx(error)
+
+
+WRONG = [0, "0", -0.1, 1, "1e-5", "nan", "inf", "100 dB", "-3dB", "0 steps", "dB", "", "x", True]
+WRONG += ["0.5 step s", None]
+
+
+@pytest.mark.parametrize("given", WRONG)
+def test_wrong_budgets_are_refused(given):
+    with pytest.raises(
+        ValueError, match=r"must be a number from 0\.000020, which single precision"
+    ):
+        parse_error(given)
+
+
+def test_impossible_budgets_say_what_is_possible(scene):
+    with pytest.raises(ValueError, match=r"^0.0001 cannot be met here: .* is within 0.00\d+$"):
+        choose(scene, 1e-4)
+
+
+# ----------------------------------------------------------------------------------------------
+# Plugin and commands
+# ----------------------------------------------------------------------------------------------
+
+
+def test_the_plugin_chooses_at_its_first_rendering():
+    scene = SCENE.load_with(error="48 dB")
+    integrator = scene.integrator()
+    assert integrator.budget_report is None
+    image = np.array(mi.render(scene, spp=1))
+    report = integrator.budget_report
+    assert report.budget == pytest.approx(10**-2.4)
+    chosen = report.chosen.approximations.non_default
+    alone = SCENE.load_with(**chosen)
+    np.testing.assert_array_equal(image, np.array(mi.render(alone, spp=1)))
+    integrator.error = 0.5
+    mi.render(scene, spp=1)
+    assert integrator.budget_report.chosen.cost < report.chosen.cost
+
+
+def test_the_plugin_refuses_what_cannot_be_met():
+    with pytest.raises(RuntimeError, match=r"splats: error must be a number from 0\.000020"):
+        SCENE.load_with(error=0.0)
+    scene = SCENE.load_with(error=2e-5)
+    with pytest.raises(PluginError, match=r"splats: error 2e-05 cannot be met here"):
+        scene.integrator().render(scene, spp=1)
+
+
+def test_render_records_the_choice_beside_images(tmp_path, fit):
+    run(fit / "point_cloud.ply", "--orbit", 2, "--error", "0.5 steps", "--out", tmp_path / "out")
+    record = json.loads((tmp_path / "out" / "error_budget.json").read_text())
+    assert record["budget"] == pytest.approx(0.5 / 255)
+    assert max(record["measured_errors"]) <= record["budget"]
+    for path in (tmp_path / "out").glob("*.png"):
+        assert json.loads(Image.open(path).text["drgs error budget"]) == record
+
+
+def test_mitsuba_scenes_are_rendered_within_the_budget(tmp_path):
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
+    run(path, "--error", 0.01, "--out", tmp_path / "out")
+    record = json.loads((tmp_path / "out" / "error_budget.json").read_text())
+    assert record["budget"] == 0.01
+    with openexr_threads():
+        metadata = mi.Bitmap(str(tmp_path / "out" / "blobs.exr")).metadata()
+    assert json.loads(metadata["drgs error budget"]) == record
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--error", 0), "argument --error: must be a number from 0.000020"),
+        (("--error", "2e-5"), "error 2e-05 cannot be met here: the most accurate choice is within"),
+    ],
+)
+def test_wrong_budgets_end_the_command(fit, tmp_path, words, message):
+    words = (fit / "point_cloud.ply", "--orbit", 2, *words, "--out", tmp_path / "out")
+    assert_refused(render.main, *words, folder=tmp_path, message=message)
