@@ -2,9 +2,10 @@
 
 Compares renderings of a trained and a stress scene (wide lens, large splats near the camera,
 interpenetrating layers) with the most accurate form: the float64 numpy reference that evaluates
-splats along each pixel's ray, sorts all of them at each pixel, and cuts only alphas below a
-millionth. A fit's images are also compared with the photographs. Tables have other images (another
-low-pass, samples per pixel, other SH) in brackets: their distance is not an error.
+splats and harmonics along each pixel's ray, sorts all splats at each pixel, and cuts only alphas
+below a millionth. What error budgets choose is measured like the other choices. A fit's images are
+also compared with the photographs. Tables have other images (another low-pass, samples per pixel,
+other SH) in brackets: their distance is not an error.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
 
-from drgs.accuracy.error_budget import choose
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.bench.output import add_out, machine, markdown_table, write_rows
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
@@ -34,11 +34,12 @@ from drgs.datasets import load_dataset
 from drgs.datasets.types import View
 from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator.error_budget import choose
 from drgs.integrator.film import SamplePoints
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
-from drgs.render import add_error
+from drgs.render import error_budget
 from drgs.results import metrics
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS
 from drgs.splatting import rendering
@@ -54,6 +55,9 @@ SLOW_S, SLOW_ROUNDS = 1.0, 2  # slower rungs are timed in SLOW_ROUNDS
 FILM_SIZE_PX = 400  # film of scenes without cameras
 CROP_SIZE_PX = 8  # side of the crops on which every pixel evaluates every splat
 MIN_ALPHA = 1e-6  # alpha cut of the most accurate form
+
+BUDGET = "error at most "  # begins the names of rungs that an error budget chooses
+BUDGETS = (0.02, 0.01, 0.005)
 
 UNCUT = {"alpha_cut": 0.0, "transmittance_stop": 0.0}
 EXACT_PIXEL = {"projection": "exact", "order": "pixel"}
@@ -86,11 +90,12 @@ RUNGS = (
     Rung("extent 3 sigma", {"extent": 3.0}),
     Rung("no cut-offs", UNCUT),
     Rung("exact, pixel order (16), no cut-offs", {**EXACT_PIXEL, "order_window": 16, **UNCUT}),
+    Rung("harmonics along each pixel's ray", {"sh_direction": "pixel"}),
+    Rung("all of these", {**EXACT_PIXEL, "order_window": 16, "sh_direction": "pixel", **UNCUT}),
     Rung("default in float64", float64=True),
     Rung("SH of degree 0", is_approximation=False, sh_degree=0),
     Rung("SH of degree 1", is_approximation=False, sh_degree=1),
     Rung("SH of degree 2", is_approximation=False, sh_degree=2),
-    Rung("SH along each pixel's ray", {"sh_direction": "pixel"}, is_approximation=False),
     Rung("antialiased low-pass", {"antialiased": True}, is_approximation=False),
     Rung("no low-pass", {"low_pass": 0.0}, is_approximation=False),
     Rung("4 samples, no low-pass", {"low_pass": 0.0}, False, samples=4),
@@ -136,7 +141,13 @@ def add_arguments(parser: CommandParser) -> None:
     add_out(parser, run, "accuracy.csv", *PLOTS)
     add_scene(parser)
     parser.add_argument("--views", type=int, default=3, help="test views of a fit (default: 3)")
-    add_error(parser)
+    parser.add_argument(
+        "--error",
+        type=error_budget,
+        nargs="+",
+        default=BUDGETS,
+        help=f"error budgets, see drgs render (default: {' '.join(map(str, BUDGETS))})",
+    )
     parser.add_argument("--quick", action="store_true", help="one view, fewer rounds")
 
 
@@ -168,25 +179,35 @@ def run(args: argparse.Namespace) -> None:
             "uncut one on crops\n",
             flush=True,
         )
-        found = measure(subject, accurate, RUNGS, QUICK_ROUNDS if args.quick else ROUNDS)
+        rungs = [*RUNGS, *rungs_of_budgets(subject, args.error)]
+        found = measure(subject, accurate, rungs, QUICK_ROUNDS if args.quick else ROUNDS)
         results += found
         print(table(found), flush=True)
-        if args.error is not None:
-            print(f"\n{chosen_within(subject, args.error)}", flush=True)
     write_rows(args.out / "accuracy.csv", AccuracyMeasurement, results)
     for subject, name in zip(subjects, PLOTS, strict=True):
         write_figure(args.out / name, plot([m for m in results if m.scene == subject.name]))
 
 
-def chosen_within(subject: Subject, error: float) -> str:
-    """Return what an error budget chooses for the subject's views, or why there is no choice."""
+def rungs_of_budgets(subject: Subject, budgets: Sequence[float]) -> list[Rung]:
+    """Return what error budgets choose for the subject's views; print each choice, or why not."""
     cameras = [device_camera(camera, llvm.Float) for camera in subject.cameras]
-    gaussians = subject.gaussians.to(llvm.TensorXf)
-    degree, background = gaussians.sh_degree, subject.background
-    try:
-        return choose(gaussians, cameras, Approximations(), degree, background, error).line()
-    except ValueError as refusal:
-        return f"error {refusal}"
+    gaussians, rungs = subject.gaussians.to(llvm.TensorXf), []
+    for budget in budgets:
+        try:
+            report = choose(
+                gaussians,
+                cameras,
+                Approximations(),
+                gaussians.sh_degree,
+                subject.background,
+                budget,
+            )
+        except ValueError as refusal:
+            print(f"error {refusal}")
+            continue
+        print(report.line(), flush=True)
+        rungs.append(Rung(f"{BUDGET}{budget:g}", report.chosen.changes))
+    return rungs
 
 
 def load_subject(path: Path, num_views: int) -> Subject:
@@ -307,7 +328,11 @@ def most_accurate(
     """Return the most accurate image, or its region (rows, columns)."""
     gaussians = reference.Gaussians(*(getattr(subject.gaussians, n) for n in PARAMETER_NAMES))
     model = reference_rays.ImageModel(
-        projection="exact", order="pixel", alpha_cut=min_alpha, transmittance_stop=0.0
+        projection="exact",
+        order="pixel",
+        sh_direction="pixel",
+        alpha_cut=min_alpha,
+        transmittance_stop=0.0,
     )
     return reference_rays.render(gaussians, camera, subject.background, model, region).image
 
@@ -405,7 +430,8 @@ def plot(results: Sequence[AccuracyMeasurement]) -> Figure:
     from matplotlib.ticker import NullLocator
 
     approximations = [m for m in results if m.is_approximation]
-    default, front = approximations[0], pareto_front(approximations)
+    default = approximations[0]
+    front = pareto_front([m for m in approximations if not m.rung.startswith(BUDGET)])
     figure = new_figure(7.6, 4.2)
     axes = figure.subplots()
 
@@ -426,6 +452,11 @@ def plot(results: Sequence[AccuracyMeasurement]) -> Figure:
     axes.plot(times, errors, "o", color="0.8", markersize=5)
     axes.plot(*zip(*map(point, front), strict=True), "o-", color="C0", markersize=8, alpha=0.6)
     axes.plot(*point(default), "o", color="C3", markersize=12)
+    for m in approximations:
+        if m.rung.startswith(BUDGET):
+            budget = 255 * float(m.rung.removeprefix(BUDGET))
+            axes.plot(*point(m), "s", color="C2", markersize=7)
+            axes.plot([point(m)[0]] * 2, [point(m)[1], budget], "-_", color="C2", linewidth=1)
     style = {"textcoords": "offset points", "fontsize": 10, "va": "center"}
     names = [
         axes.annotate(

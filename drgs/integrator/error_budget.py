@@ -1,18 +1,403 @@
-"""An error budget of the integrator ``splats``: see ``drgs.accuracy.error_budget``."""
+"""The cheapest approximations whose images stay within an error, found by measuring a few views.
+
+The error of an image is its root mean square difference from the most accurate image, over pixels
+and channels in display space: the best projection, an order per pixel, colours along each pixel's
+ray, and almost no cut-offs.
+
+Each approximation is measured alone, as the difference of two images that differ in nothing else.
+They are nearly independent, so that the squares of their errors add. The cheapest combination whose
+sum is within the budget is then compared with the most accurate image itself. Each view is measured
+in the window where most of its error lies (:class:`Window`).
+
+Nothing depends on measured times: the choice is the same in every run.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.ndimage import uniform_filter
+from scipy.stats import t as student_t
 
-from drgs.accuracy.error_budget import BudgetReport, choose
+from drgs.accuracy.pipeline import pipeline_of
+from drgs.cameras.camera import Camera
+from drgs.cameras.lens import Pinhole
+from drgs.config.approximations import Approximations, Value
+from drgs.core.arrays import types_of
+from drgs.core.constants import ALPHA_CUT, TRANSMITTANCE_STOP
 from drgs.core.errors import PluginError
-from drgs.effects.compose import without_effects
+from drgs.effects.compose import with_effects, without_effects
+from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
 from drgs.integrator.state import SplatsState
+from drgs.splatting import rendering
+
+NUM_VIEWS = 6  # that are measured, if there are so many
+WINDOW_PX = 128  # side of a window, about
+CONFIDENCE = 0.95  # share of the views that shall be within the budget
+TYPICAL_SPREAD = 0.15  # of the logarithm of the errors of a file's views
+CLEARLY = 0.9  # of the error or the time of a choice, the next one's at most
+SPREAD_VIEWS = 6  # views that TYPICAL_SPREAD counts for
+
+Changes = Mapping[str, Value]
+
+
+@dataclass(frozen=True)
+class Level:
+    """Values of approximations that are chosen together, with their typical cost."""
+
+    changes: Changes
+    cost: float  # relative to the first levels of all others, ordered by the means' depths
+    cost_ordered: float = 0.0  # ordered at each pixel; 0: the same
+
+    def factor(self, is_ordered: bool) -> float:
+        """Return the factor of the time of an image."""
+        return self.cost_ordered if is_ordered and self.cost_ordered else self.cost
+
+
+def cut_offs(alpha_cut: float, transmittance_stop: float) -> Changes:
+    """Return the values of both cut-offs."""
+    return {"alpha_cut": alpha_cut, "transmittance_stop": transmittance_stop}
+
+
+WINDOWS = {1: 3.3, 4: 4.4, 8: 7.0, 16: 12.0, 32: 22.0}
+CENTER = Level({"order": "center"}, 1)
+ORDERS = tuple(Level({"order": "pixel", "order_window": k}, cost) for k, cost in WINDOWS.items())
+DIRECTIONS = (Level({"sh_direction": "mean"}, 1), Level({"sh_direction": "pixel"}, 3, 1.6))
+CUT_OFFS = (
+    Level(cut_offs(1 / 64, 1e-2), 0.87, 0.8),
+    Level(cut_offs(ALPHA_CUT, TRANSMITTANCE_STOP), 1),
+    Level(cut_offs(1 / 2048, 1e-6), 1.25, 1.45),
+)
+FINEST_CUT_OFFS = cut_offs(1e-5, 1e-7)
+"""The times are those of ``docs/results/accuracy.md``, rounded."""
+
+
+def projections(camera: Camera) -> tuple[Level, ...]:
+    """Return the projections that a camera's lens allows, the most accurate one last."""
+    if camera.lens.parallel:
+        return (Level({"projection": "ewa"}, 1),)
+    ewa, unscented = Level({"projection": "ewa"}, 1), Level({"projection": "unscented"}, 1.03)
+    if not isinstance(camera.lens, Pinhole):
+        return ewa, unscented
+    return ewa, Level({"projection": "exact"}, 1.2, 1.05)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Approximations, with their error and time."""
+
+    approximations: Approximations
+    changes: Changes  # those of an error budget among them
+    error: float  # that CONFIDENCE of the views do not exceed; 0..1
+    cost: float  # time relative to the cheapest order and direction; typical, not measured
+
+    @property
+    def words(self) -> str:
+        """The values that differ from the default, as they are set."""
+        default = Approximations()
+        others = {k: v for k, v in self.changes.items() if v != getattr(default, k)}
+        if others.get("order") == "pixel":
+            others["order_window"] = self.changes["order_window"]
+        words = [f"{k}={v if isinstance(v, str) else f'{v:.2g}'}" for k, v in others.items()]
+        return " ".join(words) or "the default"
+
+
+@dataclass(frozen=True)
+class BudgetReport:
+    """The choice for an error budget, with its neighbours."""
+
+    budget: float
+    chosen: Choice  # its error was measured against the most accurate image
+    errors: tuple[float, ...]  # of the measured views
+    time: float  # measured, relative to the default approximations
+    better: Choice | None  # next choice with a clearly smaller error; None: there is none
+    faster: Choice | None  # next choice that is clearly faster
+    seconds: float = field(compare=False)  # that the search took
+
+    def line(self) -> str:
+        """Return one line for the user."""
+        low, high = min(self.errors), max(self.errors)
+        line = (
+            f"error at most {self.budget:.2g}: {self.chosen.words}: {low:.2g} to {high:.2g} at "
+            f"{len(self.errors)} views, {self.time:.2g} times the time of the default"
+        )
+        for other in (self.faster, self.better):
+            if other is not None:
+                factor = self.time * other.cost / self.chosen.cost
+                line += f"; {factor:.2g} times for {other.error:.2g} ({other.words})"
+        return f"{line}; found in {self.seconds:.1f} s"
+
+    def record(self) -> dict[str, Any]:
+        """Return the numbers to be recorded beside images, for JSON."""
+
+        def numbers(choice: Choice | None) -> dict[str, Any] | None:
+            if choice is None:
+                return None
+            return {**choice.changes, "error": choice.error, "cost": choice.cost / self.chosen.cost}
+
+        return {
+            "budget": self.budget,
+            "chosen": numbers(self.chosen),
+            "measured_errors": list(self.errors),
+            "time_relative_to_default": self.time,
+            "next_better": numbers(self.better),
+            "next_faster": numbers(self.faster),
+        }
+
+
+@dataclass(frozen=True)
+class Window:
+    """A window of a view, where most of the view's error lies.
+
+    The share is that of the error of a window of one splat. Errors of other approximations are
+    taken to be distributed alike, so that the error of the view follows from that of the window.
+    """
+
+    camera: Camera  # of the window
+    share: float  # of the view's squared error
+    pixels: int  # of the whole view
+
+    def mean_square(self, one: np.ndarray, other: np.ndarray) -> float:
+        """Return the mean square difference of the view from images (H, W, 3) of its window."""
+        total = float(np.square(one - other, dtype=np.float64).sum())
+        return total / self.share / (3 * self.pixels)
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """Renders Gaussians with approximations that differ from given ones."""
+
+    gaussians: Gaussians  # on the device
+    given: Approximations
+    sh_degree: int
+    background: tuple[float, float, float]  # display space
+
+    def image(self, camera: Camera, *changes: Changes) -> np.ndarray:
+        """Return (H, W, 3) float32, display space, not clamped."""
+        transmittance, *color = self._planes(camera, *changes)
+        background = np.array(self.background, np.float32)
+        image = np.stack([np.array(plane) for plane in color], axis=-1)
+        image = image + np.array(transmittance)[:, None] * background
+        return image.reshape(camera.height, camera.width, 3)
+
+    def seconds(self, camera: Camera, changes: Changes) -> float:
+        """Return the time of an image, the least of three."""
+        times = []
+        for _ in range(3):
+            dr.sync_thread()
+            started = time.perf_counter()
+            self._planes(camera, changes)
+            dr.sync_thread()
+            times.append(time.perf_counter() - started)
+        return min(times)
+
+    def _planes(self, camera: Camera, *changes: Changes) -> list:
+        approximations = self.given
+        for change in changes:
+            approximations = replace(approximations, **change)
+        pipeline = pipeline_of(approximations, self.sh_degree)
+        with dr.suspend_grad():
+            pipeline = with_effects(pipeline, self.gaussians, camera)
+            planes = rendering.render(self.gaussians, camera, pipeline).planes()
+            dr.eval(planes)
+        return planes
+
+    def view(self, camera: Camera) -> Window:
+        """Return the window of a camera's image."""
+        one, other = (
+            self.image(camera, CUT_OFFS[1].changes, order.changes) for order in (CENTER, ORDERS[0])
+        )
+        error = np.square(one - other, dtype=np.float64).sum(axis=-1)
+        scale = min(1.0, WINDOW_PX / math.sqrt(error.size))
+        height, width = (min(n, 4 * math.ceil(scale * n / 4)) for n in error.shape)
+        sums = uniform_filter(error, (height, width), mode="constant", origin=(0, 0))
+        rows, columns = (n - k + 1 for n, k in zip(error.shape, (height, width), strict=True))
+        sums = sums[height // 2 :, width // 2 :][:rows, :columns]
+        y, x = np.unravel_index(int(np.argmax(sums)), sums.shape)
+        total = error.sum()
+        inside = error[y : y + height, x : x + width].sum()
+        share = float(inside / total) if total > 0 else error[:height, :width].size / error.size
+        return Window(crop(camera, int(x), int(y), width, height), share, error.size)
+
+
+def crop(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
+    """Return the camera of a window of the film."""
+    t = types_of(type(camera.near))
+    offset = t.Array2f(dr.opaque(t.Float, x), dr.opaque(t.Float, y))
+    return replace(
+        camera,
+        principal=camera.principal - offset,
+        film_start=camera.film_start - offset,
+        film_end=camera.film_end - offset,
+        width=width,
+        height=height,
+    )
+
+
+def bound(errors: Sequence[float]) -> float:
+    """Return the error that :data:`CONFIDENCE` of all views do not exceed, from those of some.
+
+    Errors are log-normal; their spread is that of the views, and a typical one's.
+    """
+    logs = np.log(np.maximum(errors, 1e-9))
+    count = len(logs)
+    freedom = count - 1 + SPREAD_VIEWS
+    squares = np.square(logs - logs.mean()).sum() + SPREAD_VIEWS * TYPICAL_SPREAD**2
+    width = student_t.ppf(CONFIDENCE, freedom) * math.sqrt(squares / freedom * (1 + 1 / count))
+    return float(np.exp(logs.mean() + width))
+
+
+def measured_places(num_views: int) -> list[int]:
+    """Return the places of the views that are measured, evenly among all."""
+    count = min(NUM_VIEWS, num_views)
+    return [int((k + 0.5) * num_views / count) for k in range(count)]
+
+
+class Search:
+    """Combinations of levels on some views, their predicted errors, and those measured."""
+
+    def __init__(self, renderer: Renderer, views: Sequence[Window], budget: float) -> None:
+        """Measure each level alone, and predict the errors of all combinations."""
+        self.budget, self._renderer, self._views = budget, renderer, views
+        self._rendered: dict[frozenset, list[np.ndarray]] = {}
+        projected = projections(views[0].camera)
+        first = projected[0], CENTER, DIRECTIONS[0], CUT_OFFS[1]
+        self._start = {k: v for level in first for k, v in level.changes.items()}
+        orders = self._squares_of_orders()
+        squares = [
+            orders,
+            self._squares(projected, projected[-1].changes),
+            self._squares(DIRECTIONS, DIRECTIONS[-1].changes),
+            self._squares(CUT_OFFS, FINEST_CUT_OFFS),
+        ]
+        self.front = _front(renderer.given, squares)
+        """Combinations that no other one beats in cost and predicted error, by cost."""
+        finest, self._unordered = orders[-1]
+        last = projected[-1], finest, DIRECTIONS[-1]
+        best = {k: v for level in last for k, v in level.changes.items()}
+        self._references = self._images(best | FINEST_CUT_OFFS)
+
+    def _images(self, changes: Changes) -> list[np.ndarray]:
+        """Return the images of the views, with the cheapest approximations but for ``changes``."""
+        values = {**self._start, **changes}
+        key = frozenset(values.items())
+        if key not in self._rendered:
+            found = [self._renderer.image(view.camera, values) for view in self._views]
+            self._rendered[key] = found
+        return self._rendered[key]
+
+    def _differences(self, changes: Changes, target: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the mean square differences (V,) of the views from the images ``target``."""
+        triples = zip(self._views, self._images(changes), target, strict=True)
+        return np.array([view.mean_square(one, other) for view, one, other in triples])
+
+    def _squares(self, levels: Sequence[Level], finest: Changes) -> list[tuple[Level, np.ndarray]]:
+        target = self._images(finest)
+        return [(level, self._differences(level.changes, target)) for level in levels]
+
+    def _squares_of_orders(self) -> list[tuple[Level, np.ndarray]]:
+        """Return those of orders; the last one's is extrapolated from the two windows before it."""
+        found = self._squares((CENTER, *ORDERS[:-1]), ORDERS[-1].changes)
+        before, last = found[-2][1], found[-1][1]
+        rest = last * np.minimum(last / np.maximum(before, 1e-20), 0.5)
+        return [*found, (ORDERS[-1], rest)]
+
+    def measure(self, choice: Choice) -> list[float]:
+        """Return the errors of the views against the most accurate images, whose own is added."""
+        squares = self._differences(choice.changes, self._references) + self._unordered
+        return [float(error) for error in np.sqrt(squares)]
+
+    def cheapest(self) -> tuple[int, list[float], list[float]]:
+        """Return the place in ``front`` of the cheapest choice within the budget.
+
+        Also the errors of its views, and those of all of ``front``: predictions are corrected by
+        what was measured last. Raises ValueError if no choice is within the budget.
+        """
+        measured: dict[int, list[float]] = {}
+        correction, last = 1.0, len(self.front) - 1
+        while True:
+            errors = [
+                bound(measured[k]) if k in measured else correction * choice.error
+                for k, choice in enumerate(self.front)
+            ]
+            place = next((k for k, error in enumerate(errors) if error <= self.budget), last)
+            if place not in measured:
+                measured[place] = self.measure(self.front[place])
+                correction = bound(measured[place]) / self.front[place].error
+            elif errors[place] <= self.budget:
+                return place, measured[place], errors
+            else:
+                raise ValueError(
+                    f"{self.budget:.2g} cannot be met here: the most accurate choice is within "
+                    f"{_rounded_up(errors[place])}"
+                )
+
+
+def _rounded_up(error: float) -> str:
+    digits = 1 - math.floor(math.log10(error))
+    return f"{math.ceil(error * 10**digits) / 10**digits:g}"
+
+
+def _front(
+    given: Approximations, found: Sequence[Sequence[tuple[Level, np.ndarray]]]
+) -> list[Choice]:
+    """Return the combinations that no other one beats in cost and error, by cost."""
+    choices = []
+    for levels in product(*found):
+        changes = {k: v for level, _ in levels for k, v in level.changes.items()}
+        is_ordered = changes["order"] != "center"
+        cost = math.prod(level.factor(is_ordered) for level, _ in levels)
+        error = bound(np.sqrt(sum(squares for _, squares in levels)))
+        choices.append(Choice(replace(given, **changes), changes, error, cost))
+    front: list[Choice] = []
+    for choice in sorted(choices, key=lambda choice: (choice.cost, choice.error)):
+        if not front or choice.error < front[-1].error:
+            front.append(choice)
+    return front
+
+
+def choose(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    given: Approximations,
+    sh_degree: int,
+    background: tuple[float, float, float],
+    budget: float,
+) -> BudgetReport:
+    """Return the cheapest approximations whose error is within ``budget``, and their neighbours.
+
+    gaussians: on the device; cameras: those of the render, from which some are taken; an open
+    shutter is not measured; given: approximations whose filters and falloff are kept.
+
+    Raises ValueError if no combination is within the budget.
+    """
+    started = time.perf_counter()
+    renderer = Renderer(gaussians, given, sh_degree, background)
+    measured = [replace(cameras[k], shutter=None) for k in measured_places(len(cameras))]
+    search = Search(renderer, [renderer.view(camera) for camera in measured], budget)
+    place, of_views, errors = search.cheapest()
+    front = [replace(one, error=error) for one, error in zip(search.front, errors, strict=True)]
+    chosen, default = front[place], Approximations()
+    default_changes = {name: getattr(default, name) for name in chosen.changes}
+    times = [renderer.seconds(measured[0], c) for c in (chosen.changes, default_changes)]
+    return BudgetReport(
+        budget,
+        chosen,
+        tuple(of_views),
+        times[0] / times[1],
+        next((one for one in front[place:] if one.error < CLEARLY * chosen.error), None),
+        next((one for one in front[place::-1] if one.cost < CLEARLY * chosen.cost), None),
+        time.perf_counter() - started,
+    )
 
 
 def meet_error_budget(

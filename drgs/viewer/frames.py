@@ -33,9 +33,12 @@ MIN_DEPTH_ALPHA = 0.5  # opacity from which a pixel's depth counts for the range
 DEPTH_RANGE = (2, 98)  # percentiles of these depths at the ends of the colour map
 ERROR_GAIN = 5.0
 
-MOST_ACCURATE = {"order": "pixel", "order_window": 16, "alpha_cut": 0.0, "transmittance_stop": 0.0}
+MOST_ACCURATE = {
+    **{"order": "pixel", "order_window": 16, "sh_direction": "pixel"},
+    **{"alpha_cut": 0.0, "transmittance_stop": 0.0},
+}
 """Approximations of the image that ``error`` compares with, besides the lens's most accurate
-projection; filter and harmonics are the model's."""
+projection; the filter is the model's."""
 
 
 @dataclass(frozen=True, eq=False)

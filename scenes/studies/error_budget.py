@@ -1,9 +1,9 @@
 """Does an error budget keep its word, what does it save, and what would an oracle save?
 
-Approximations are chosen for 46 views of each scene (``drgs.accuracy.error_budget``), and judged at
-the 40 that were not measured, against the most accurate image: a window of 64 splats, and almost no
-cut-offs. The oracle has the errors of all combinations at some of these views, and takes the
-cheapest one that is within the budget in 95 % of them.
+For 46 views of each scene, ``drgs.integrator.error_budget`` chooses approximations. They are judged
+at the 40 views that it has not measured, against the most accurate image: a window of 64 splats,
+and almost no cut-offs. The oracle has the errors of all combinations at some of these views, and
+takes the cheapest one that is within the budget in 95 % of them.
 
 Scenes: the shipped truck; fits and files that the command line names; a dense scene, needles, and a
 wide lens (``drgs.bench.scenes``).
@@ -22,7 +22,6 @@ import drgs
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from drgs.accuracy import error_budget as budgets
 from drgs.bench.output import machine, markdown_table
 from drgs.bench.scenes import bench_gaussians, device_camera, stress_scene
 from drgs.cameras.camera import Camera
@@ -30,6 +29,7 @@ from drgs.config.approximations import Approximations
 from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.datasets.viewpoints import FIELD_OF_VIEW
 from drgs.gaussians.parameters import Gaussians
+from drgs.integrator import error_budget as budgets
 from drgs.integrator.scene import make_sensors
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.results.model import load_model

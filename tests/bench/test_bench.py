@@ -232,6 +232,9 @@ def subject():
     return accuracy.Subject("small", gaussians, [camera], [photograph], (1.0, 1.0, 1.0))
 
 
+ALL = next(rung for rung in accuracy.RUNGS if rung.name == "all of these")
+
+
 def image_of(subject, **approximations):
     rung = accuracy.Rung("", approximations)
     return accuracy.RungRenderer.from_rung(rung, subject, subject.cameras[0]).image()
@@ -245,6 +248,7 @@ def test_each_rung_comes_closer_to_the_most_accurate_image(subject):
         {"projection": "exact"},
         {"projection": "exact", "order": "pixel", "order_window": 16},
         {"projection": "exact", "order": "pixel", "order_window": 16, **accuracy.UNCUT},
+        ALL.approximations,
     ]
     errors = [np.abs(image_of(subject, **step) - accurate).mean() for step in steps]
     assert all(after < before for before, after in pairwise(errors))
@@ -306,13 +310,16 @@ def test_the_command_measures_a_ply_and_the_stress_scene(tmp_path, capsys, monke
     bench_gaussians(50).save(tmp_path / "few.ply")
     monkeypatch.setattr(accuracy, "FILM_SIZE_PX", 32)
     monkeypatch.setattr(accuracy, "RUNGS", accuracy.RUNGS[:3])
-    bench.main(["accuracy", str(tmp_path / "few.ply"), "--quick", "--out", str(tmp_path)])
+    words = ["--quick", "--error", "0.1", "--out", str(tmp_path)]
+    bench.main(["accuracy", str(tmp_path / "few.ply"), *words])
     printed = capsys.readouterr().out
     assert "few: 50 Gaussians, 1 views" in printed and "| stress |" in printed
     with (tmp_path / "accuracy.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["scene"], row["rung"]) for row in rows] == [
-        (scene, rung) for scene in ("few", "stress") for rung in ("default", "unscented", "exact")
+        (scene, rung)
+        for scene in ("few", "stress")
+        for rung in ("default", "unscented", "exact", "error at most 0.1")
     ]
     assert Image.open(tmp_path / "accuracy.png").size[0] > 800
 
@@ -327,7 +334,7 @@ def test_measurement_includes_the_smoothing_filter(tmp_path, subject):
     found = replace(found, cameras=subject.cameras, background=subject.background)
     accurate = accuracy.most_accurate(found, found.cameras[0], accuracy.MIN_ALPHA)
     without = accuracy.most_accurate(subject, subject.cameras[0], accuracy.MIN_ALPHA)
-    image = image_of(found, projection="exact", order="pixel", order_window=16, **accuracy.UNCUT)
+    image = image_of(found, **ALL.approximations)
     # The error of the last rung; the filter is as wide as the splats and changes far more.
     assert np.abs(image - accurate).mean() < 1e-4 < 0.01 < np.abs(accurate - without).mean()
 

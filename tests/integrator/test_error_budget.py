@@ -14,12 +14,12 @@ from support.small_capture import pose_around
 from support.views import Scene
 
 from drgs import render
-from drgs.accuracy import error_budget as budgets
 from drgs.bench.scenes import device_camera, stress_scene
 from drgs.cameras.lens import LENSES
 from drgs.config.approximations import Approximations, parse_error
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.integrator import error_budget as budgets
 from drgs.io.scenes import openexr_threads
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
@@ -103,7 +103,7 @@ def test_windows_show_a_part_of_the_image(scene):
 
 
 def test_a_bound_holds_for_most_views_of_the_same_kind():
-    """Of log-normal errors with the typical spread, as the words promise."""
+    """Errors are log-normal, with the typical spread."""
     rng = np.random.default_rng(0)
     errors = np.exp(rng.normal(-6, budgets.TYPICAL_SPREAD, (4000, 5)))
     within = [view <= budgets.bound(measured) for *measured, view in errors]
