@@ -7,7 +7,7 @@ ray, and almost no cut-offs.
 Each approximation is measured alone, as the difference of two images that differ in nothing else.
 They are nearly independent, so that the squares of their errors add. The cheapest combination whose
 sum is within the budget is then compared with the most accurate image itself. Each view is measured
-in the window where most of its error lies (:class:`Window`).
+in one window (:meth:`Renderer.window`).
 
 Nothing depends on measured times: the choice is the same in every run.
 """
@@ -24,7 +24,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import uniform_filter
 from scipy.stats import t as student_t
 
 from drgs.accuracy.pipeline import pipeline_of
@@ -41,7 +40,8 @@ from drgs.integrator.state import SplatsState
 from drgs.splatting import rendering
 
 NUM_VIEWS = 6  # that are measured, if there are so many
-WINDOW_PX = 128  # side of a window, about
+WINDOW_PX = 140  # side of a window, at most about
+AREA_SHARE = 0.2  # of the probability of a cell, by its area; the rest by its error
 CONFIDENCE = 0.95  # share of the views that shall be within the budget
 TYPICAL_SPREAD = 0.15  # of the logarithm of the errors of a file's views
 CLEARLY = 0.9  # of the error or the time of a choice, the next one's at most
@@ -156,14 +156,10 @@ class BudgetReport:
 
 @dataclass(frozen=True)
 class Window:
-    """A window of a view, where most of the view's error lies.
-
-    The share is that of the error of a window of one splat. Errors of other approximations are
-    taken to be distributed alike, so that the error of the view follows from that of the window.
-    """
+    """A window of a view, from which the error of the whole view is estimated."""
 
     camera: Camera  # of the window
-    share: float  # of the view's squared error
+    share: float  # probability with which it was drawn from the view's
     pixels: int  # of the whole view
 
     def mean_square(self, one: np.ndarray, other: np.ndarray) -> float:
@@ -211,22 +207,39 @@ class Renderer:
             dr.eval(planes)
         return planes
 
-    def view(self, camera: Camera) -> Window:
-        """Return the window of a camera's image."""
+    def window(self, camera: Camera, place: float) -> Window:
+        """Return a window of a camera's image; place: 0..1, of its cell among those of the film.
+
+        Cells are drawn in proportion to the error of an order by one splat, and to a part to their
+        area: the mean over places of the errors of cells, divided by their shares, is the error of
+        the image.
+        """
         one, other = (
             self.image(camera, CUT_OFFS[1].changes, order.changes) for order in (CENTER, ORDERS[0])
         )
         error = np.square(one - other, dtype=np.float64).sum(axis=-1)
-        scale = min(1.0, WINDOW_PX / math.sqrt(error.size))
-        height, width = (min(n, 4 * math.ceil(scale * n / 4)) for n in error.shape)
-        sums = uniform_filter(error, (height, width), mode="constant", origin=(0, 0))
-        rows, columns = (n - k + 1 for n, k in zip(error.shape, (height, width), strict=True))
-        sums = sums[height // 2 :, width // 2 :][:rows, :columns]
-        y, x = np.unravel_index(int(np.argmax(sums)), sums.shape)
-        total = error.sum()
-        inside = error[y : y + height, x : x + width].sum()
-        share = float(inside / total) if total > 0 else error[:height, :width].size / error.size
-        return Window(crop(camera, int(x), int(y), width, height), share, error.size)
+        height, width = error.shape
+        rows, columns = (np.arange(0, size, _cell_size(size)) for size in error.shape)
+        area = np.ones_like(error)
+        shares = [
+            np.add.reduceat(np.add.reduceat(each / max(each.sum(), 1e-30), rows), columns, axis=1)
+            for each in (error, area)
+        ]
+        shares = shares[0] * (1 - AREA_SHARE) + shares[1] * AREA_SHARE
+        shares /= shares.sum()
+        order = np.argsort(-shares.ravel(), kind="stable")
+        cell = order[
+            min(int(np.searchsorted(np.cumsum(shares.ravel()[order]), place)), shares.size - 1)
+        ]
+        y, x = rows[cell // len(columns)], columns[cell % len(columns)]
+        size = min(_cell_size(width), width - x), min(_cell_size(height), height - y)
+        share = float(shares.ravel()[cell])
+        return Window(crop(camera, int(x), int(y), *map(int, size)), share, error.size)
+
+
+def _cell_size(size: int) -> int:
+    """Return the side of cells along a side of the film, px."""
+    return 4 * math.ceil(size / math.ceil(size / WINDOW_PX) / 4)
 
 
 def crop(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
@@ -248,12 +261,13 @@ def bound(errors: Sequence[float]) -> float:
 
     Errors are log-normal; their spread is that of the views, and a typical one's.
     """
-    logs = np.log(np.maximum(errors, 1e-9))
+    squares = np.maximum(np.square(errors), 1e-18)
+    logs = 0.5 * np.log(squares)
     count = len(logs)
     freedom = count - 1 + SPREAD_VIEWS
-    squares = np.square(logs - logs.mean()).sum() + SPREAD_VIEWS * TYPICAL_SPREAD**2
-    width = student_t.ppf(CONFIDENCE, freedom) * math.sqrt(squares / freedom * (1 + 1 / count))
-    return float(np.exp(logs.mean() + width))
+    deviations = np.square(logs - logs.mean()).sum() + SPREAD_VIEWS * TYPICAL_SPREAD**2
+    width = student_t.ppf(CONFIDENCE, freedom) * math.sqrt(deviations / freedom * (1 + 1 / count))
+    return math.sqrt(squares.mean()) * math.exp(width)
 
 
 def measured_places(num_views: int) -> list[int]:
@@ -383,7 +397,10 @@ def choose(
     started = time.perf_counter()
     renderer = Renderer(gaussians, given, sh_degree, background)
     measured = [replace(cameras[k], shutter=None) for k in measured_places(len(cameras))]
-    search = Search(renderer, [renderer.view(camera) for camera in measured], budget)
+    windows = [
+        renderer.window(camera, (k + 0.5) / len(measured)) for k, camera in enumerate(measured)
+    ]
+    search = Search(renderer, windows, budget)
     place, of_views, errors = search.cheapest()
     front = [replace(one, error=error) for one, error in zip(search.front, errors, strict=True)]
     chosen, default = front[place], Approximations()
