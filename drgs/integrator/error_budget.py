@@ -259,15 +259,15 @@ def crop(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
 def bound(errors: Sequence[float]) -> float:
     """Return the error that :data:`CONFIDENCE` of all views do not exceed, from those of some.
 
-    Errors are log-normal; their spread is that of the views, and a typical one's.
+    Above their root mean square, errors are log-normal. Their spread is that of the views above it,
+    and a typical one's: views that are nearly exact say nothing of the others.
     """
-    squares = np.maximum(np.square(errors), 1e-18)
-    logs = 0.5 * np.log(squares)
-    count = len(logs)
-    freedom = count - 1 + SPREAD_VIEWS
-    deviations = np.square(logs - logs.mean()).sum() + SPREAD_VIEWS * TYPICAL_SPREAD**2
-    width = student_t.ppf(CONFIDENCE, freedom) * math.sqrt(deviations / freedom * (1 + 1 / count))
-    return math.sqrt(squares.mean()) * math.exp(width)
+    center = max(math.sqrt(np.mean(np.square(errors))), 1e-9)
+    above = np.log(np.maximum(errors, center) / center)
+    freedom, count = len(errors) - 1 + SPREAD_VIEWS, len(errors)
+    variance = (2 * np.square(above).sum() + SPREAD_VIEWS * TYPICAL_SPREAD**2) / freedom
+    width = student_t.ppf(CONFIDENCE, freedom) * math.sqrt(variance * (1 + 1 / count))
+    return center * math.exp(width)
 
 
 def measured_places(num_views: int) -> list[int]:
