@@ -29,7 +29,7 @@ from scipy.stats import t as student_t
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Pinhole
-from drgs.config.approximations import Approximations, Value
+from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations, Value
 from drgs.core.arrays import types_of
 from drgs.core.constants import ALPHA_CUT, TRANSMITTANCE_STOP
 from drgs.core.errors import PluginError
@@ -68,9 +68,11 @@ def cut_offs(alpha_cut: float, transmittance_stop: float) -> Changes:
     return {"alpha_cut": alpha_cut, "transmittance_stop": transmittance_stop}
 
 
-WINDOWS = {1: 3.3, 4: 4.4, 8: 7.0, 16: 12.0, 32: 22.0}
+COSTS_OF_WINDOWS = {1: 3.3, 4: 4.4, 8: 7.0, 16: 12.0, 32: 22.0}
 CENTER = Level({"order": "center"}, 1)
-ORDERS = tuple(Level({"order": "pixel", "order_window": k}, cost) for k, cost in WINDOWS.items())
+WINDOWED = tuple(
+    Level({"order": "pixel", "order_window": k}, cost) for k, cost in COSTS_OF_WINDOWS.items()
+)
 DIRECTIONS = (Level({"sh_direction": "mean"}, 1), Level({"sh_direction": "pixel"}, 3, 1.6))
 CUT_OFFS = (
     Level(cut_offs(1 / 64, 1e-2), 0.87, 0.8),
@@ -81,14 +83,13 @@ FINEST_CUT_OFFS = cut_offs(1e-5, 1e-7)
 """The times are those of ``docs/results/accuracy.md``, rounded."""
 
 
-def projections(camera: Camera) -> tuple[Level, ...]:
-    """Return the projections that a camera's lens allows, the most accurate one last."""
-    if camera.lens.parallel:
-        return (Level({"projection": "ewa"}, 1),)
+def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:
+    """Return the projections that the cameras' lenses allow, the most accurate one last."""
     ewa, unscented = Level({"projection": "ewa"}, 1), Level({"projection": "unscented"}, 1.03)
-    if not isinstance(camera.lens, Pinhole):
-        return ewa, unscented
-    return ewa, Level({"projection": "exact"}, 1.2, 1.05)
+    if all(isinstance(camera.lens, Pinhole) for camera in cameras):
+        return ewa, Level({"projection": "exact"}, 1.2, 1.05)
+    # Projected along parallel rays, Gaussians are Gaussians.
+    return (ewa,) if all(camera.lens.parallel for camera in cameras) else (ewa, unscented)
 
 
 @dataclass(frozen=True)
@@ -215,7 +216,8 @@ class Renderer:
         the image.
         """
         one, other = (
-            self.image(camera, CUT_OFFS[1].changes, order.changes) for order in (CENTER, ORDERS[0])
+            self.image(camera, CUT_OFFS[1].changes, order.changes)
+            for order in (CENTER, WINDOWED[0])
         )
         error = np.square(one - other, dtype=np.float64).sum(axis=-1)
         height, width = error.shape
@@ -283,7 +285,7 @@ class Search:
         """Measure each level alone, and predict the errors of all combinations."""
         self.budget, self._renderer, self._views = budget, renderer, views
         self._rendered: dict[frozenset, list[np.ndarray]] = {}
-        projected = projections(views[0].camera)
+        projected = projections([view.camera for view in views])
         first = projected[0], CENTER, DIRECTIONS[0], CUT_OFFS[1]
         self._start = {k: v for level in first for k, v in level.changes.items()}
         orders = self._squares_of_orders()
@@ -320,10 +322,10 @@ class Search:
 
     def _squares_of_orders(self) -> list[tuple[Level, np.ndarray]]:
         """Return those of orders; the last one's is extrapolated from the two windows before it."""
-        found = self._squares((CENTER, *ORDERS[:-1]), ORDERS[-1].changes)
+        found = self._squares((CENTER, *WINDOWED[:-1]), WINDOWED[-1].changes)
         before, last = found[-2][1], found[-1][1]
         rest = last * np.minimum(last / np.maximum(before, 1e-20), 0.5)
-        return [*found, (ORDERS[-1], rest)]
+        return [*found, (WINDOWED[-1], rest)]
 
     def measure(self, choice: Choice) -> list[float]:
         """Return the errors of the views against the most accurate images, whose own is added."""
@@ -392,8 +394,14 @@ def choose(
     gaussians: on the device; cameras: those of the render, from which some are taken; an open
     shutter is not measured; given: approximations whose filters and falloff are kept.
 
-    Raises ValueError if no combination is within the budget.
+    Raises ValueError if no combination is within the budget, or parts are extensions.
     """
+    for registry in (PROJECTIONS, FALLOFFS, ORDERS):
+        if (value := getattr(given, registry.kind)) not in registry.shipped_names:
+            raise ValueError(
+                f"cannot be met with the {registry.kind} '{value}', which is not drgs's own: what "
+                "is accurate, is not known; leave one of them out"
+            )
     started = time.perf_counter()
     renderer = Renderer(gaussians, given, sh_degree, background)
     measured = [replace(cameras[k], shutter=None) for k in measured_places(len(cameras))]

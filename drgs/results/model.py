@@ -125,8 +125,8 @@ class Model:
     ignored: str = ""  # effects not simulated: see the plugin
     folder: Path | None = None  # of the file, with optional refined cameras
     from_header: Collection[str] = ()  # names of settings from the file's header
-    error: float | None = None  # budget of the approximations' error; None: as ``settings``
     render: Render = render_views
+    error: float | None = None  # budget of the approximations' error; None: as ``settings``
 
     def scene(self) -> mi.Scene:
         """Return a Mitsuba scene that renders in display space."""

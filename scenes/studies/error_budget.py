@@ -111,10 +111,10 @@ def study(subject: Subject) -> list[list[str]]:
     degree = subject.gaussians.sh_degree
     renderer = budgets.Renderer(subject.gaussians, subject.given, degree, subject.background)
     judged = subject.judged_at
-    projections = budgets.projections(judged[0])
+    projections = budgets.projections(judged)
     best = projections[-1].changes
     truths = [renderer.image(camera, best, TRUTH) for camera in judged]
-    most_accurate = {**best, **budgets.ORDERS[-1].changes, **budgets.DIRECTIONS[-1].changes}
+    most_accurate = {**best, **budgets.WINDOWED[-1].changes, **budgets.DIRECTIONS[-1].changes}
     slow = renderer.seconds(judged[0], most_accurate | budgets.FINEST_CUT_OFFS)
 
     def errors(changes: budgets.Changes, count: int) -> np.ndarray:
@@ -161,7 +161,7 @@ def _oracle(
     projections: tuple[budgets.Level, ...], errors: Callable[[budgets.Changes], np.ndarray]
 ) -> list[tuple[float, float]]:
     """Return cost and error, which most views do not exceed, of all combinations."""
-    orders, found = (budgets.CENTER, *budgets.ORDERS), []
+    orders, found = (budgets.CENTER, *budgets.WINDOWED), []
     for levels in product(projections, orders, budgets.DIRECTIONS, budgets.CUT_OFFS):
         changes = {k: v for level in levels for k, v in level.changes.items()}
         cost = math.prod(level.factor(changes["order"] != "center") for level in levels)

@@ -1,5 +1,6 @@
 """Approximations that an error budget chooses, against the float64 reference of exact images."""
 
+import argparse
 import json
 from dataclasses import replace
 
@@ -13,16 +14,19 @@ from support.render_command import run, sensor, write_scene
 from support.small_capture import pose_around
 from support.views import Scene
 
-from drgs import render
+from drgs import render, view
 from drgs.bench.scenes import device_camera, stress_scene
 from drgs.cameras.lens import LENSES
-from drgs.config.approximations import Approximations, parse_error
+from drgs.config.approximations import FALLOFFS, Approximations, parse_error
 from drgs.core.errors import PluginError
+from drgs.core.registry import temporary_registrations
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator import error_budget as budgets
 from drgs.io.scenes import openexr_threads
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
+from drgs.results.model import load_model
+from drgs.splatting.footprint import GaussianFalloff
 
 SIZE, BLACK = 48, (0.0, 0.0, 0.0)
 SCENE = Scene(count=300)
@@ -106,7 +110,7 @@ def test_a_bound_holds_for_most_views_of_the_same_kind():
     """Errors are log-normal, with the typical spread."""
     rng = np.random.default_rng(0)
     errors = np.exp(rng.normal(-6, budgets.TYPICAL_SPREAD, (4000, 5)))
-    within = [view <= budgets.bound(measured) for *measured, view in errors]
+    within = [one <= budgets.bound(measured) for *measured, one in errors]
     assert 0.93 < np.mean(within) < 0.98
 
 
@@ -134,6 +138,13 @@ def test_wrong_budgets_are_refused(given):
 def test_impossible_budgets_say_what_is_possible(scene):
     with pytest.raises(ValueError, match=r"^0.0001 cannot be met here: .* is within 0.00\d+$"):
         choose(scene, 1e-4)
+
+
+def test_budgets_are_refused_with_extensions(scene):
+    with temporary_registrations():
+        FALLOFFS.register("mine")(GaussianFalloff)
+        with pytest.raises(ValueError, match="cannot be met with the falloff 'mine', which is not"):
+            choose(scene, 0.05, replace(SHIPPED, falloff="mine"))
 
 
 # ----------------------------------------------------------------------------------------------
@@ -171,6 +182,15 @@ def test_render_records_the_choice_beside_images(tmp_path, fit):
     assert max(record["measured_errors"]) <= record["budget"]
     for path in (tmp_path / "out").glob("*.png"):
         assert json.loads(Image.open(path).text["drgs error budget"]) == record
+
+
+def test_viewers_show_images_within_the_budget(fit, capsys):
+    model = load_model(fit / "point_cloud.ply")
+    args = argparse.Namespace(what=fit / "point_cloud.ply", up=None)
+    found = model.within_error(0.002, view.cameras_of(args, model))
+    assert "error at most 0.002: " in capsys.readouterr().out
+    assert found.settings.approximations != model.settings.approximations
+    assert found.gaussians is model.gaussians
 
 
 def test_mitsuba_scenes_are_rendered_within_the_budget(tmp_path):
