@@ -132,7 +132,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - Largest root mean square error of an image in display space, from 0.00002 to below 1, also
          as "54 dB" or "0.5 steps" (of 8 bits). The cheapest approximations within it are found at
          the first rendering, on windows of a few of the scene's sensors; they replace those below
-         except for filters, falloff, ``alpha_max`` and ``extent``. (Default: none)
+         except for filters, falloff, ``alpha_max`` and ``extent``, and an open shutter's samples. (Default: none)
      * - projection, falloff, order, order_window, sh_direction, alpha_max, alpha_cut,
          transmittance_stop, extent, low_pass, antialiased
        - |string|, |int|, |float| or |bool|

@@ -69,6 +69,11 @@ class Shutter(Protocol):
         """Return the cameras whose images are averaged."""
         ...
 
+    def with_samples(self, samples: int) -> Shutter:
+        """Return the shutter with another number of times, if it has one."""
+        del samples
+        return self
+
     def camera_of(self, means: Array3f, camera: Camera) -> Camera:
         """Return the camera that sees each of some means (world)."""
         ...
@@ -210,6 +215,12 @@ def _map(value: Any, function: Callable[[Float], Float]) -> Any:
     return type(value)([_map(item, function) for item in value])
 
 
-def cameras_in_time(camera: Camera) -> list[Camera]:
-    """Return the cameras whose images are averaged: one unless it is blurred by motion."""
-    return [camera] if camera.shutter is None else camera.shutter.cameras(camera)
+def cameras_in_time(camera: Camera, samples: int | None = None) -> list[Camera]:
+    """Return the cameras whose images are averaged: one unless it is blurred by motion.
+
+    samples: number of times of a shutter that is open; None: its own.
+    """
+    shutter = camera.shutter
+    if shutter is None:
+        return [camera]
+    return (shutter if samples is None else shutter.with_samples(samples)).cameras(camera)

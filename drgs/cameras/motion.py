@@ -73,6 +73,10 @@ class MotionBlur(Motion):
         return [self.pose(camera, (k + 0.5) / self.samples) for k in range(self.samples)]
 
     @override
+    def with_samples(self, samples: int) -> MotionBlur:
+        return replace(self, samples=samples)
+
+    @override
     def camera_of(self, means: Array3f, camera: Camera) -> Camera:
         raise ValueError("a camera that motion blurs has an image for each of its cameras_in_time")
 

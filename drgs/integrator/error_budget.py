@@ -27,11 +27,12 @@ import numpy as np
 from scipy.stats import t as student_t
 
 from drgs.accuracy.pipeline import pipeline_of
-from drgs.cameras.camera import Camera
+from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.cameras.lens import Pinhole
-from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations, Value
+from drgs.cameras.motion import MotionBlur
+from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
 from drgs.core.arrays import types_of
-from drgs.core.constants import ALPHA_CUT, TRANSMITTANCE_STOP
+from drgs.core.constants import ALPHA_CUT, MAX_SHUTTER_SAMPLES, TRANSMITTANCE_STOP
 from drgs.core.errors import PluginError
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
@@ -47,7 +48,10 @@ TYPICAL_SPREAD = 0.15  # of the logarithm of the errors of a file's views
 CLEARLY = 0.9  # of the error or the time of a choice, the next one's at most
 SPREAD_VIEWS = 6  # views that TYPICAL_SPREAD counts for
 
-Changes = Mapping[str, Value]
+SAMPLES = "shutter_samples"
+
+Changes = Mapping[str, Any]
+"""Values of approximations by name, and of :data:`SAMPLES`."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,22 @@ def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:
     return (ewa,) if all(camera.lens.parallel for camera in cameras) else (ewa, unscented)
 
 
+def own_samples(cameras: Sequence[Camera]) -> int:
+    """Return the largest number of times of an open shutter; 0: no camera has one."""
+    shutters = [one.shutter for one in cameras]
+    return max((one.samples for one in shutters if isinstance(one, MotionBlur)), default=0)
+
+
+def shutter_samples(cameras: Sequence[Camera]) -> tuple[Level, ...]:
+    """Return numbers of times of an open shutter, if a camera has one; costs relative to its own.
+
+    Twice the last one is taken for exact.
+    """
+    own = own_samples(cameras)
+    counts = sorted({max(1, own // 4), max(1, own // 2), own, 2 * own}) if own else []
+    return tuple(Level({SAMPLES: n}, n / own) for n in counts if n <= MAX_SHUTTER_SAMPLES)
+
+
 @dataclass(frozen=True)
 class Choice:
     """Approximations, with their error and time."""
@@ -102,10 +122,15 @@ class Choice:
     cost: float  # time relative to the cheapest order and direction; typical, not measured
 
     @property
+    def shutter_samples(self) -> int | None:
+        """Times of an open shutter; None: no camera has one."""
+        return self.changes.get(SAMPLES)
+
+    @property
     def words(self) -> str:
         """The values that differ from the default, as they are set."""
         default = Approximations()
-        others = {k: v for k, v in self.changes.items() if v != getattr(default, k)}
+        others = {k: v for k, v in self.changes.items() if v != getattr(default, k, None)}
         if others.get("order") == "pixel":
             others["order_window"] = self.changes["order_window"]
         words = [f"{k}={v if isinstance(v, str) else f'{v:.2g}'}" for k, v in others.items()]
@@ -180,28 +205,28 @@ class Renderer:
 
     def image(self, camera: Camera, *changes: Changes) -> np.ndarray:
         """Return (H, W, 3) float32, display space, not clamped."""
-        transmittance, *color = self._planes(camera, *changes)
+        values = {k: v for change in changes for k, v in change.items()}
+        samples, images = values.pop(SAMPLES, 1), []
         background = np.array(self.background, np.float32)
-        image = np.stack([np.array(plane) for plane in color], axis=-1)
-        image = image + np.array(transmittance)[:, None] * background
-        return image.reshape(camera.height, camera.width, 3)
+        for one in cameras_in_time(camera, samples):
+            transmittance, *color = self._planes(one, values)
+            image = np.stack([np.array(plane) for plane in color], axis=-1)
+            images.append(image + np.array(transmittance)[:, None] * background)
+        return np.mean(images, axis=0).reshape(camera.height, camera.width, 3)
 
     def seconds(self, camera: Camera, changes: Changes) -> float:
-        """Return the time of an image, the least of three."""
-        times = []
+        """Return the time of an image at one time, the least of three."""
+        (camera,), times = cameras_in_time(camera, 1), []
         for _ in range(3):
             dr.sync_thread()
             started = time.perf_counter()
-            self._planes(camera, changes)
+            self._planes(camera, {k: v for k, v in changes.items() if k != SAMPLES})
             dr.sync_thread()
             times.append(time.perf_counter() - started)
         return min(times)
 
-    def _planes(self, camera: Camera, *changes: Changes) -> list:
-        approximations = self.given
-        for change in changes:
-            approximations = replace(approximations, **change)
-        pipeline = pipeline_of(approximations, self.sh_degree)
+    def _planes(self, camera: Camera, changes: Changes) -> list:
+        pipeline = pipeline_of(replace(self.given, **changes), self.sh_degree)
         with dr.suspend_grad():
             pipeline = with_effects(pipeline, self.gaussians, camera)
             planes = rendering.render(self.gaussians, camera, pipeline).planes()
@@ -295,6 +320,9 @@ class Search:
             self._squares(DIRECTIONS, DIRECTIONS[-1].changes),
             self._squares(CUT_OFFS, FINEST_CUT_OFFS),
         ]
+        if samples := shutter_samples([view.camera for view in views]):
+            squares.append(self._squares(samples, {SAMPLES: 2 * samples[-1].changes[SAMPLES]}))
+        self._squares_of_samples = squares[4] if samples else []
         self.front = _front(renderer.given, squares)
         """Combinations that no other one beats in cost and predicted error, by cost."""
         finest, self._unordered = orders[-1]
@@ -329,7 +357,11 @@ class Search:
 
     def measure(self, choice: Choice) -> list[float]:
         """Return the errors of the views against the most accurate images, whose own is added."""
-        squares = self._differences(choice.changes, self._references) + self._unordered
+        changes = {k: v for k, v in choice.changes.items() if k != SAMPLES}
+        squares = self._differences(changes, self._references) + self._unordered
+        for level, error in self._squares_of_samples:
+            if level.changes[SAMPLES] == choice.shutter_samples:
+                squares = squares + error
         return [float(error) for error in np.sqrt(squares)]
 
     def cheapest(self) -> tuple[int, list[float], list[float]]:
@@ -373,7 +405,8 @@ def _front(
         is_ordered = changes["order"] != "center"
         cost = math.prod(level.factor(is_ordered) for level, _ in levels)
         error = bound(np.sqrt(sum(squares for _, squares in levels)))
-        choices.append(Choice(replace(given, **changes), changes, error, cost))
+        approximations = replace(given, **{k: v for k, v in changes.items() if k != SAMPLES})
+        choices.append(Choice(approximations, changes, error, cost))
     front: list[Choice] = []
     for choice in sorted(choices, key=lambda choice: (choice.cost, choice.error)):
         if not front or choice.error < front[-1].error:
@@ -391,8 +424,8 @@ def choose(
 ) -> BudgetReport:
     """Return the cheapest approximations whose error is within ``budget``, and their neighbours.
 
-    gaussians: on the device; cameras: those of the render, from which some are taken; an open
-    shutter is not measured; given: approximations whose filters and falloff are kept.
+    gaussians: on the device; cameras: those of the render, from which some are taken; given:
+    approximations whose filters and falloff are kept.
 
     Raises ValueError if no combination is within the budget, or parts are extensions.
     """
@@ -404,7 +437,7 @@ def choose(
             )
     started = time.perf_counter()
     renderer = Renderer(gaussians, given, sh_degree, background)
-    measured = [replace(cameras[k], shutter=None) for k in measured_places(len(cameras))]
+    measured = [cameras[k] for k in measured_places(len(cameras))]
     windows = [
         renderer.window(camera, (k + 0.5) / len(measured)) for k, camera in enumerate(measured)
     ]
@@ -412,8 +445,10 @@ def choose(
     place, of_views, errors = search.cheapest()
     front = [replace(one, error=error) for one, error in zip(search.front, errors, strict=True)]
     chosen, default = front[place], Approximations()
-    default_changes = {name: getattr(default, name) for name in chosen.changes}
-    times = [renderer.seconds(measured[0], c) for c in (chosen.changes, default_changes)]
+    usual = {name: getattr(default, name) for name in chosen.changes if name != SAMPLES}
+    times = [renderer.seconds(measured[0], changes) for changes in (chosen.changes, usual)]
+    if chosen.shutter_samples is not None:
+        times[0] *= chosen.shutter_samples / own_samples(measured)
     return BudgetReport(
         budget,
         chosen,
@@ -430,8 +465,8 @@ def meet_error_budget(
 ) -> BudgetReport:
     """Set the cheapest approximations whose images are within ``budget``; return what was found.
 
-    sensors: those that are to be rendered. Surfaces, films' filters and open shutters are left out
-    of what is measured, and a textured background is black. Raises :class:`PluginError` if the
+    sensors: those that are to be rendered. Surfaces and films' filters are left out of what is
+    measured, and a textured background is black. Raises :class:`PluginError` if the
     budget cannot be met.
     """
     alone = [one for sensor in sensors for one in sensors_of(sensor)]
@@ -451,4 +486,5 @@ def meet_error_budget(
     except ValueError as error:
         raise PluginError(f"splats: error {error}") from None
     splats.approximations = report.chosen.approximations
+    splats.shutter_samples = report.chosen.shutter_samples
     return report

@@ -95,7 +95,7 @@ class SensorRender:
                 dr.accum_grad(self.splats.background, d_constant)
             of_cameras = [gradients.camera for gradients in by_time if gradients.camera]
             if of_cameras:
-                accumulate_in_sensor(self.splats.ignore, state, of_cameras)
+                accumulate_in_sensor(self._attached_cameras(state), of_cameras)
         return reduce(rendering.sum_of_gradients, by_time)
 
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
@@ -186,7 +186,7 @@ class SensorRender:
         state = self._state()
         cameras = [of_time[0].camera for of_time in self._frames()]
         if state.is_attached:
-            cameras = _attached_cameras(self.splats.ignore, state)
+            cameras = self._attached_cameras(state)
         film = self.sensor.film()
         colors = radiance = background_radiance(film, behind, cameras, self._offsets)
         if environment is None or not splats.srgb_primitives:
@@ -242,14 +242,18 @@ class SensorRender:
         return read_sensor(self.sensor, self.splats.near)
 
     def _cameras(self, state: SensorState) -> list[Camera]:
-        return cameras_in_time(without_effects(camera_from_sensor(state), self.splats.ignore))
+        camera = without_effects(camera_from_sensor(state), self.splats.ignore)
+        return cameras_in_time(camera, self.splats.shutter_samples)
+
+    def _attached_cameras(self, state: SensorState) -> list[Camera]:
+        return attached_cameras(state, self.splats.ignore, self.splats.shutter_samples)
 
     def _camera_tangents(self, count: int) -> Sequence[list[mi.Float] | None]:
         """Return the tangents of each time's ``Camera.numbers()`` along those of the sensor."""
         state = self._state()
         if not state.is_attached:
             return [None] * count
-        numbers = [camera.numbers() for camera in _attached_cameras(self.splats.ignore, state)]
+        numbers = [camera.numbers() for camera in self._attached_cameras(state)]
         dr.forward_to(numbers, flags=dr.ADFlag.ClearEdges)
         return dr.grad(numbers)
 
@@ -317,11 +321,12 @@ def constant_background(splats: SplatsState) -> mi.Color3f | None:
     return constant
 
 
-def accumulate_in_sensor(
-    ignored: Collection[str], state: SensorState, gradients: list[list[Float]]
-) -> None:
-    """Accumulate derivatives by ``Camera.numbers()``, by time, into a sensor."""
-    numbers = chain(*(camera.numbers() for camera in _attached_cameras(ignored, state)))
+def accumulate_in_sensor(cameras: Sequence[Camera], gradients: list[list[Float]]) -> None:
+    """Accumulate derivatives by ``Camera.numbers()``, by time, into the sensor of the cameras.
+
+    cameras: from :func:`attached_cameras`.
+    """
+    numbers = chain(*(camera.numbers() for camera in cameras))
     pairs = zip(numbers, chain(*gradients), strict=True)
     attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]
     for value, gradient in attached:
@@ -330,9 +335,12 @@ def accumulate_in_sensor(
     dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
 
 
-def _attached_cameras(ignored: Collection[str], state: SensorState) -> list[Camera]:
+def attached_cameras(
+    state: SensorState, ignored: Collection[str], samples: int | None = None
+) -> list[Camera]:
+    """Return the cameras of a sensor with its derivatives; samples: of an open shutter."""
     dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
-    return cameras_in_time(without_effects(state.make(state), ignored))
+    return cameras_in_time(without_effects(state.make(state), ignored), samples)
 
 
 LENS_POINTS = 16  # fixed points of an aperture; a small, bright light is seen as this many

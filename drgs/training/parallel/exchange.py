@@ -34,7 +34,7 @@ from drgs.core.constants import MAX_SHUTTER_SAMPLES
 from drgs.core.types import Array2f, Bool, Float, UInt32
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.sensor_render import accumulate_in_sensor
+from drgs.integrator.sensor_render import accumulate_in_sensor, attached_cameras
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.types import SplatsPlugin
 from drgs.splatting.rasterize import SplatGradients
@@ -440,7 +440,8 @@ class ViewExchange:
         each.first_nonfinite = total.first_nonfinite
         if of_cameras:
             state = read_sensor(each.view.view.sensor, self.integrator.near)
-            accumulate_in_sensor(self.integrator.ignore, state, of_cameras)
+            cameras = attached_cameras(state, self.integrator.ignore)
+            accumulate_in_sensor(cameras, of_cameras)
 
     def _accumulate(self, gradients: Gaussians) -> None:
         for name, parameter in self.params.items():
