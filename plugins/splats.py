@@ -131,8 +131,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - |float| or |string|
        - Largest root mean square error of an image in display space, from 0.00002 to below 1, also
          as "54 dB" or "0.5 steps" (of 8 bits). The cheapest approximations within it are found at
-         the first rendering, on windows of a few of the scene's sensors; they replace those below
-         except for filters, falloff, ``alpha_max`` and ``extent``, and an open shutter's samples. (Default: none)
+         the first rendering, on windows of a few of the scene's sensors, and so are the samples of
+         an open shutter. Filters, falloff, ``alpha_max`` and ``extent`` stay. (Default: none)
      * - projection, falloff, order, order_window, sh_direction, alpha_max, alpha_cut,
          transmittance_stop, extent, low_pass, antialiased
        - |string|, |int|, |float| or |bool|
@@ -364,10 +364,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
             shade(self.state, scene)
         if self.state.error is not None and self.state.budget_report is None:
-            from drgs.integrator.error_budget import meet_error_budget
+            self._meet_error_budget(scene, self.state.error)
 
-            sensors = scene.sensors() or [self.state.cache.sensor]
-            report = meet_error_budget(self.state, sensors, self.state.error)
+    def _meet_error_budget(self, scene: mi.Scene, error: float) -> None:
+        """Choose approximations for the scene's sensors, or for the one that is rendered."""
+        from drgs.integrator.error_budget import meet_error_budget
+
+        alone = self.state.cache.sensor
+        if sensors := scene.sensors() or ([] if alone is None else [alone]):
+            report = meet_error_budget(self.state, sensors, error)
             self.state.budget_report = report
             mi.Log(mi.LogLevel.Info, report.line())
 

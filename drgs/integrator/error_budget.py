@@ -466,8 +466,8 @@ def meet_error_budget(
     """Set the cheapest approximations whose images are within ``budget``; return what was found.
 
     sensors: those that are to be rendered. Surfaces and films' filters are left out of what is
-    measured, and a textured background is black. Raises :class:`PluginError` if the
-    budget cannot be met.
+    measured, and a textured background is black. Raises :class:`PluginError` if the budget cannot
+    be met.
     """
     alone = [one for sensor in sensors for one in sensors_of(sensor)]
     cameras = [
