@@ -5,9 +5,10 @@ and channels in display space: the best projection, an order per pixel, colours 
 ray, and almost no cut-offs.
 
 Each approximation is measured alone, as the difference of two images that differ in nothing else.
-They are nearly independent, so that the squares of their errors add. The cheapest combination whose
-sum is within the budget is then compared with the most accurate image itself. Each view is measured
-in one window (:meth:`Renderer.window`).
+They are nearly independent, so that the squares of their errors add. What takes no order per pixel
+is measured on whole views; orders are, in a window of each (:meth:`Renderer.view`). There, the
+cheapest combination within the budget is also compared with the most accurate image, which corrects
+the sum.
 
 Nothing depends on measured times: the choice is the same in every run.
 """
@@ -19,7 +20,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -40,7 +41,8 @@ from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
 from drgs.integrator.state import SplatsState
 from drgs.splatting import rendering
 
-NUM_VIEWS = 6  # that are measured, if there are so many
+MIN_VIEWS, MAX_VIEWS = 3, 6  # that are measured, if there are so many
+MAX_PIXELS = 4_000_000  # of them together, unless they are the fewest
 WINDOW_PX = 140  # side of a window, at most about
 AREA_SHARE = 0.2  # of the probability of a cell, by its area; the rest by its error
 CONFIDENCE = 0.95  # share of the views that shall be within the budget
@@ -181,17 +183,19 @@ class BudgetReport:
 
 
 @dataclass(frozen=True)
-class Window:
-    """A window of a view, from which the error of the whole view is estimated."""
+class View:
+    """A view that is measured, and the window in which orders are."""
 
-    camera: Camera  # of the window
-    share: float  # probability with which it was drawn from the view's
-    pixels: int  # of the whole view
+    camera: Camera
+    rows: slice  # of the window
+    columns: slice
+    window: Camera
+    share: float  # probability with which the window was drawn
 
     def mean_square(self, one: np.ndarray, other: np.ndarray) -> float:
         """Return the mean square difference of the view from images (H, W, 3) of its window."""
         total = float(np.square(one - other, dtype=np.float64).sum())
-        return total / self.share / (3 * self.pixels)
+        return total / self.share / (3 * self.camera.width * self.camera.height)
 
 
 @dataclass(frozen=True)
@@ -233,8 +237,8 @@ class Renderer:
             dr.eval(planes)
         return planes
 
-    def window(self, camera: Camera, place: float) -> Window:
-        """Return a window of a camera's image; place: 0..1, of its cell among those of the film.
+    def view(self, camera: Camera, place: float) -> View:
+        """Return a view with a window; place: 0..1, of the window among the cells of the film.
 
         Cells are drawn in proportion to the error of an order by one splat, and to a part to their
         area: the mean over places of the errors of cells, divided by their shares, is the error of
@@ -245,23 +249,23 @@ class Renderer:
             for order in (CENTER, WINDOWED[0])
         )
         error = np.square(one - other, dtype=np.float64).sum(axis=-1)
-        height, width = error.shape
         rows, columns = (np.arange(0, size, _cell_size(size)) for size in error.shape)
-        area = np.ones_like(error)
-        shares = [
-            np.add.reduceat(np.add.reduceat(each / max(each.sum(), 1e-30), rows), columns, axis=1)
-            for each in (error, area)
-        ]
-        shares = shares[0] * (1 - AREA_SHARE) + shares[1] * AREA_SHARE
+        shares = AREA_SHARE * _sums(np.ones_like(error), rows, columns)
+        shares = (shares + (1 - AREA_SHARE) * _sums(error, rows, columns)).ravel()
         shares /= shares.sum()
-        order = np.argsort(-shares.ravel(), kind="stable")
-        cell = order[
-            min(int(np.searchsorted(np.cumsum(shares.ravel()[order]), place)), shares.size - 1)
-        ]
-        y, x = rows[cell // len(columns)], columns[cell % len(columns)]
-        size = min(_cell_size(width), width - x), min(_cell_size(height), height - y)
-        share = float(shares.ravel()[cell])
-        return Window(crop(camera, int(x), int(y), *map(int, size)), share, error.size)
+        order = np.argsort(-shares, kind="stable")
+        cell = order[min(np.searchsorted(np.cumsum(shares[order]), place), shares.size - 1)]
+        (y, x), (height, width) = divmod(int(cell), len(columns)), error.shape
+        y, x = int(rows[y]), int(columns[x])
+        end_y, end_x = min(y + _cell_size(height), height), min(x + _cell_size(width), width)
+        window = crop(camera, x, y, end_x - x, end_y - y)
+        return View(camera, slice(y, end_y), slice(x, end_x), window, float(shares[cell]))
+
+
+def _sums(values: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the sums of cells, relative to that of all; rows, columns: where cells begin."""
+    sums = np.add.reduceat(np.add.reduceat(values, rows), columns, axis=1)
+    return sums / max(sums.sum(), 1e-30)
 
 
 def _cell_size(size: int) -> int:
@@ -297,20 +301,38 @@ def bound(errors: Sequence[float]) -> float:
     return center * math.exp(width)
 
 
-def measured_places(num_views: int) -> list[int]:
-    """Return the places of the views that are measured, evenly among all."""
-    count = min(NUM_VIEWS, num_views)
+def measured_places(num_views: int, pixels: int) -> list[int]:
+    """Return the places of the views that are measured, evenly among all; pixels: of a view."""
+    count = min(num_views, max(MIN_VIEWS, min(MAX_VIEWS, MAX_PIXELS // pixels)))
     return [int((k + 0.5) * num_views / count) for k in range(count)]
+
+
+class LevelSquares(NamedTuple):
+    """The mean square errors of a level alone."""
+
+    level: Level
+    of_views: np.ndarray  # (V,)
+    in_windows: np.ndarray  # (V,): those of the views, as their windows tell
+
+
+class Candidate(NamedTuple):
+    """A combination of levels; its squares are the sums of those of the levels."""
+
+    choice: Choice  # with a predicted error
+    of_views: np.ndarray
+    in_windows: np.ndarray
 
 
 class Search:
     """Combinations of levels on some views, their predicted errors, and those measured."""
 
-    def __init__(self, renderer: Renderer, views: Sequence[Window], budget: float) -> None:
+    def __init__(self, renderer: Renderer, views: Sequence[View], budget: float) -> None:
         """Measure each level alone, and predict the errors of all combinations."""
         self.budget, self._renderer, self._views = budget, renderer, views
-        self._rendered: dict[frozenset, list[np.ndarray]] = {}
-        projected = projections([view.camera for view in views])
+        self._whole: dict[frozenset, list[np.ndarray]] = {}
+        self._windows: dict[frozenset, list[np.ndarray]] = {}
+        cameras = [view.camera for view in views]
+        projected = projections(cameras)
         first = projected[0], CENTER, DIRECTIONS[0], CUT_OFFS[1]
         self._start = {k: v for level in first for k, v in level.changes.items()}
         orders = self._squares_of_orders()
@@ -320,69 +342,96 @@ class Search:
             self._squares(DIRECTIONS, DIRECTIONS[-1].changes),
             self._squares(CUT_OFFS, FINEST_CUT_OFFS),
         ]
-        if samples := shutter_samples([view.camera for view in views]):
-            squares.append(self._squares(samples, {SAMPLES: 2 * samples[-1].changes[SAMPLES]}))
-        self._squares_of_samples = squares[4] if samples else []
+        samples = shutter_samples(cameras)
+        self._most_samples = {SAMPLES: 2 * samples[-1].changes[SAMPLES]} if samples else {}
+        if samples:
+            squares.append(self._squares(samples, self._most_samples))
         self.front = _front(renderer.given, squares)
         """Combinations that no other one beats in cost and predicted error, by cost."""
-        finest, self._unordered = orders[-1]
-        last = projected[-1], finest, DIRECTIONS[-1]
+        finest = orders[-1]
+        self._unordered = finest.of_views
+        last = projected[-1], finest.level, DIRECTIONS[-1]
         best = {k: v for level in last for k, v in level.changes.items()}
-        self._references = self._images(best | FINEST_CUT_OFFS)
+        self._references = self._in_windows(best | FINEST_CUT_OFFS)
 
-    def _images(self, changes: Changes) -> list[np.ndarray]:
+    def _of_views(self, changes: Changes) -> list[np.ndarray]:
         """Return the images of the views, with the cheapest approximations but for ``changes``."""
         values = {**self._start, **changes}
         key = frozenset(values.items())
-        if key not in self._rendered:
+        if key not in self._whole:
             found = [self._renderer.image(view.camera, values) for view in self._views]
-            self._rendered[key] = found
-        return self._rendered[key]
+            self._whole[key] = found
+        return self._whole[key]
+
+    def _in_windows(self, changes: Changes) -> list[np.ndarray]:
+        """Return the images of the windows, likewise."""
+        values = {**self._start, **changes}
+        if values["order"] == CENTER.changes["order"]:
+            pairs = zip(self._of_views(changes), self._views, strict=True)
+            return [image[view.rows, view.columns] for image, view in pairs]
+        key = frozenset(values.items())
+        if key not in self._windows:
+            found = [self._renderer.image(view.window, values) for view in self._views]
+            self._windows[key] = found
+        return self._windows[key]
 
     def _differences(self, changes: Changes, target: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the mean square differences (V,) of the views from the images ``target``."""
-        triples = zip(self._views, self._images(changes), target, strict=True)
+        """Return the mean square differences (V,) of the views, from those of the windows."""
+        triples = zip(self._views, self._in_windows(changes), target, strict=True)
         return np.array([view.mean_square(one, other) for view, one, other in triples])
 
-    def _squares(self, levels: Sequence[Level], finest: Changes) -> list[tuple[Level, np.ndarray]]:
-        target = self._images(finest)
-        return [(level, self._differences(level.changes, target)) for level in levels]
+    def _squares(self, levels: Sequence[Level], finest: Changes) -> list[LevelSquares]:
+        exact, found = self._of_views(finest), []
+        for level in levels:
+            pairs = zip(self._of_views(level.changes), exact, strict=True)
+            squares = [np.square(one - other, dtype=np.float64).mean() for one, other in pairs]
+            in_windows = self._differences(level.changes, self._in_windows(finest))
+            found.append(LevelSquares(level, np.array(squares), in_windows))
+        return found
 
-    def _squares_of_orders(self) -> list[tuple[Level, np.ndarray]]:
+    def _squares_of_orders(self) -> list[LevelSquares]:
         """Return those of orders; the last one's is extrapolated from the two windows before it."""
-        found = self._squares((CENTER, *WINDOWED[:-1]), WINDOWED[-1].changes)
-        before, last = found[-2][1], found[-1][1]
-        rest = last * np.minimum(last / np.maximum(before, 1e-20), 0.5)
-        return [*found, (WINDOWED[-1], rest)]
+        levels, target = (CENTER, *WINDOWED[:-1]), self._in_windows(WINDOWED[-1].changes)
+        squares = [self._differences(level.changes, target) for level in levels]
+        before, last = squares[-2:]
+        squares.append(last * np.minimum(last / np.maximum(before, 1e-20), 0.5))
+        return [
+            LevelSquares(level, found, found)
+            for level, found in zip((CENTER, *WINDOWED), squares, strict=True)
+        ]
 
-    def measure(self, choice: Choice) -> list[float]:
-        """Return the errors of the views against the most accurate images, whose own is added."""
-        changes = {k: v for k, v in choice.changes.items() if k != SAMPLES}
-        squares = self._differences(changes, self._references) + self._unordered
-        for level, error in self._squares_of_samples:
-            if level.changes[SAMPLES] == choice.shutter_samples:
-                squares = squares + error
-        return [float(error) for error in np.sqrt(squares)]
+    def correction(self, candidate: Candidate) -> float:
+        """Return the measured square error in the windows, relative to the sum of the levels'.
+
+        The errors of the most accurate image, and of the times of a shutter, are added.
+        """
+        changes = {k: v for k, v in candidate.choice.changes.items() if k != SAMPLES}
+        measured = self._differences(changes, self._references) + self._unordered
+        if self._most_samples:
+            samples = {SAMPLES: candidate.choice.changes[SAMPLES]}
+            measured += self._differences(samples, self._in_windows(self._most_samples))
+        return float(measured.sum() / max(candidate.in_windows.sum(), 1e-30))
 
     def cheapest(self) -> tuple[int, list[float], list[float]]:
         """Return the place in ``front`` of the cheapest choice within the budget.
 
-        Also the errors of its views, and those of all of ``front``: predictions are corrected by
-        what was measured last. Raises ValueError if no choice is within the budget.
+        Also the errors of its views, and those of all of ``front``. Sums are corrected by what was
+        measured, of other choices by what was measured last. Raises ValueError if no choice is
+        within the budget.
         """
-        measured: dict[int, list[float]] = {}
+        corrections: dict[int, float] = {}
         correction, last = 1.0, len(self.front) - 1
         while True:
             errors = [
-                bound(measured[k]) if k in measured else correction * choice.error
-                for k, choice in enumerate(self.front)
+                bound(np.sqrt(corrections.get(k, correction) * candidate.of_views))
+                for k, candidate in enumerate(self.front)
             ]
             place = next((k for k, error in enumerate(errors) if error <= self.budget), last)
-            if place not in measured:
-                measured[place] = self.measure(self.front[place])
-                correction = bound(measured[place]) / self.front[place].error
+            if place not in corrections:
+                correction = corrections[place] = self.correction(self.front[place])
             elif errors[place] <= self.budget:
-                return place, measured[place], errors
+                of_views = np.sqrt(corrections[place] * self.front[place].of_views)
+                return place, of_views.tolist(), errors
             else:
                 raise ValueError(
                     f"{self.budget:.2g} cannot be met here: the most accurate choice is within "
@@ -395,22 +444,21 @@ def _rounded_up(error: float) -> str:
     return f"{math.ceil(error * 10**digits) / 10**digits:g}"
 
 
-def _front(
-    given: Approximations, found: Sequence[Sequence[tuple[Level, np.ndarray]]]
-) -> list[Choice]:
+def _front(given: Approximations, squares: Sequence[Sequence[LevelSquares]]) -> list[Candidate]:
     """Return the combinations that no other one beats in cost and error, by cost."""
-    choices = []
-    for levels in product(*found):
-        changes = {k: v for level, _ in levels for k, v in level.changes.items()}
+    found = []
+    for levels in product(*squares):
+        changes = {k: v for each in levels for k, v in each.level.changes.items()}
         is_ordered = changes["order"] != "center"
-        cost = math.prod(level.factor(is_ordered) for level, _ in levels)
-        error = bound(np.sqrt(sum(squares for _, squares in levels)))
+        cost = math.prod(each.level.factor(is_ordered) for each in levels)
+        of_views, in_windows = (sum(terms) for terms in list(zip(*levels, strict=True))[1:])
         approximations = replace(given, **{k: v for k, v in changes.items() if k != SAMPLES})
-        choices.append(Choice(approximations, changes, error, cost))
-    front: list[Choice] = []
-    for choice in sorted(choices, key=lambda choice: (choice.cost, choice.error)):
-        if not front or choice.error < front[-1].error:
-            front.append(choice)
+        choice = Choice(approximations, changes, bound(np.sqrt(of_views)), cost)
+        found.append(Candidate(choice, of_views, in_windows))
+    front: list[Candidate] = []
+    for one in sorted(found, key=lambda one: (one.choice.cost, one.choice.error)):
+        if not front or one.choice.error < front[-1].choice.error:
+            front.append(one)
     return front
 
 
@@ -437,13 +485,13 @@ def choose(
             )
     started = time.perf_counter()
     renderer = Renderer(gaussians, given, sh_degree, background)
-    measured = [cameras[k] for k in measured_places(len(cameras))]
-    windows = [
-        renderer.window(camera, (k + 0.5) / len(measured)) for k, camera in enumerate(measured)
-    ]
-    search = Search(renderer, windows, budget)
+    pixels = max(camera.width * camera.height for camera in cameras)
+    measured = [cameras[k] for k in measured_places(len(cameras), pixels)]
+    views = [renderer.view(one, (k + 0.5) / len(measured)) for k, one in enumerate(measured)]
+    search = Search(renderer, views, budget)
     place, of_views, errors = search.cheapest()
-    front = [replace(one, error=error) for one, error in zip(search.front, errors, strict=True)]
+    pairs = zip(search.front, errors, strict=True)
+    front = [replace(one.choice, error=error) for one, error in pairs]
     chosen, default = front[place], Approximations()
     usual = {name: getattr(default, name) for name in chosen.changes if name != SAMPLES}
     times = [renderer.seconds(measured[0], changes) for changes in (chosen.changes, usual)]

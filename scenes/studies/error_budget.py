@@ -36,7 +36,7 @@ from drgs.results.model import load_model
 
 BUDGETS = (0.01, 0.005, 0.003, 0.002)
 NUM_VIEWS = 46
-ORACLE_VIEWS = 6  # of those judged, on which all combinations are rendered
+ORACLE_VIEWS = 4  # of those judged, on which all combinations are rendered
 TRUTH = {"order": "pixel", "order_window": 64, "sh_direction": "pixel"}
 TRUTH |= budgets.cut_offs(1e-6, 1e-8)
 UP = (0.0, 0.0, 1.0)
@@ -55,7 +55,9 @@ class Subject:
     @property
     def judged_at(self) -> list[Camera]:
         """The views that are not measured."""
-        measured = set(budgets.measured_places(len(self.cameras)))
+        camera = self.cameras[0]
+        pixels = camera.width * camera.height
+        measured = set(budgets.measured_places(len(self.cameras), pixels))
         return [one for k, one in enumerate(self.cameras) if k not in measured]
 
 
