@@ -70,7 +70,7 @@ def exact_images(scene):
     return [reference_rays.render(of_numpy, one, BLACK, model).image for one in cameras[1::2]]
 
 
-@pytest.mark.parametrize("budget", [0.05, 0.01])
+@pytest.mark.parametrize("budget", [0.05, pytest.param(0.01, marks=pytest.mark.slow)])
 def test_other_views_are_within_the_budget_of_exact_images(scene, exact_images, budget):
     chosen = choose(scene, budget).chosen.approximations
     for camera, expected in zip(scene[1][1::2], exact_images, strict=True):
@@ -80,6 +80,7 @@ def test_other_views_are_within_the_budget_of_exact_images(scene, exact_images, 
     assert default > 0.02, "a scene on which the smaller budgets take something"
 
 
+@pytest.mark.slow
 def test_smaller_budgets_cost_more_and_the_choice_is_the_same_in_every_run(scene):
     reports = [choose(scene, budget) for budget in (0.05, 0.02)]
     costs = [report.chosen.cost for report in reports]
@@ -137,11 +138,13 @@ def test_wrong_budgets_are_refused(given):
         parse_error(given)
 
 
+@pytest.mark.slow
 def test_impossible_budgets_say_what_is_possible(scene):
     with pytest.raises(ValueError, match=r"^0.0001 cannot be met here: .* is within 0.00\d+$"):
         choose(scene, 1e-4)
 
 
+@pytest.mark.slow
 def test_times_of_an_open_shutter_are_chosen(scene):
     """More than the sensor has for a small budget, fewer for a large one; its image follows."""
     gaussians, (camera, *_) = scene
