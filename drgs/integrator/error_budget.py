@@ -183,7 +183,7 @@ class BudgetReport:
 
 
 @dataclass(frozen=True)
-class View:
+class MeasuredView:
     """A view that is measured, and the window in which orders are."""
 
     camera: Camera
@@ -237,7 +237,7 @@ class Renderer:
             dr.eval(planes)
         return planes
 
-    def view(self, camera: Camera, place: float) -> View:
+    def view(self, camera: Camera, place: float) -> MeasuredView:
         """Return a view with a window; place: 0..1, of the window among the cells of the film.
 
         Cells are drawn in proportion to the error of an order by one splat, and to a part to their
@@ -259,7 +259,7 @@ class Renderer:
         y, x = int(rows[y]), int(columns[x])
         end_y, end_x = min(y + _cell_size(height), height), min(x + _cell_size(width), width)
         window = crop(camera, x, y, end_x - x, end_y - y)
-        return View(camera, slice(y, end_y), slice(x, end_x), window, float(shares[cell]))
+        return MeasuredView(camera, slice(y, end_y), slice(x, end_x), window, float(shares[cell]))
 
 
 def _sums(values: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -315,7 +315,7 @@ class LevelSquares(NamedTuple):
     in_windows: np.ndarray  # (V,): those of the views, as their windows tell
 
 
-class Candidate(NamedTuple):
+class Combination(NamedTuple):
     """A combination of levels; its squares are the sums of those of the levels."""
 
     choice: Choice  # with a predicted error
@@ -326,7 +326,7 @@ class Candidate(NamedTuple):
 class Search:
     """Combinations of levels on some views, their predicted errors, and those measured."""
 
-    def __init__(self, renderer: Renderer, views: Sequence[View], budget: float) -> None:
+    def __init__(self, renderer: Renderer, views: Sequence[MeasuredView], budget: float) -> None:
         """Measure each level alone, and predict the errors of all combinations."""
         self.budget, self._renderer, self._views = budget, renderer, views
         self._whole: dict[frozenset, list[np.ndarray]] = {}
@@ -400,7 +400,7 @@ class Search:
             for level, found in zip((CENTER, *WINDOWED), squares, strict=True)
         ]
 
-    def correction(self, candidate: Candidate) -> float:
+    def correction(self, candidate: Combination) -> float:
         """Return the measured square error in the windows, relative to the sum of the levels'.
 
         The errors of the most accurate image, and of the times of a shutter, are added.
@@ -444,7 +444,7 @@ def _rounded_up(error: float) -> str:
     return f"{math.ceil(error * 10**digits) / 10**digits:g}"
 
 
-def _front(given: Approximations, squares: Sequence[Sequence[LevelSquares]]) -> list[Candidate]:
+def _front(given: Approximations, squares: Sequence[Sequence[LevelSquares]]) -> list[Combination]:
     """Return the combinations that no other one beats in cost and error, by cost."""
     found = []
     for levels in product(*squares):
@@ -454,8 +454,8 @@ def _front(given: Approximations, squares: Sequence[Sequence[LevelSquares]]) -> 
         of_views, in_windows = (sum(terms) for terms in list(zip(*levels, strict=True))[1:])
         approximations = replace(given, **{k: v for k, v in changes.items() if k != SAMPLES})
         choice = Choice(approximations, changes, bound(np.sqrt(of_views)), cost)
-        found.append(Candidate(choice, of_views, in_windows))
-    front: list[Candidate] = []
+        found.append(Combination(choice, of_views, in_windows))
+    front: list[Combination] = []
     for one in sorted(found, key=lambda one: (one.choice.cost, one.choice.error)):
         if not front or one.choice.error < front[-1].choice.error:
             front.append(one)
