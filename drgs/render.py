@@ -340,11 +340,12 @@ def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
 
 
 def render_mitsuba_scene(
-    path: Path, folder: ImageFolder, definitions: dict[str, str], error: float | None = None
+    path: Path, folder: ImageFolder, definitions: dict[str, str], budget: float | None = None
 ) -> None:
     """Render every sensor of a Mitsuba scene to EXR (all channels) and PNG (colours in sRGB).
 
-    definitions: values for the parameters ($name) of the scene file; error: the error budget.
+    definitions: values for the parameters ($name) of the scene file; budget: of the error, instead
+    of the scene's own.
     """
     try:
         scene = load_scene_file(path, **definitions)
@@ -352,20 +353,22 @@ def render_mitsuba_scene(
         raise UserError(f"{path}: {reason_of_mitsuba(error)}") from None
     if not isinstance(scene, mi.Scene) or scene.integrator() is None or not scene.sensors():
         raise UserError(f"{path}: the scene must hold an integrator and at least one sensor")
-    if error is not None:
-        if not is_splats(scene.integrator()):
+    integrator = scene.integrator()
+    splats = integrator.state if is_splats(integrator) else None
+    if budget is not None:
+        if splats is None:
             raise UserError("--error: the scene's own integrator must be splats")
-        scene.integrator().error = error
+        splats.error, splats.budget_report = budget, None
     stem, count = shorten_stem(path.stem), len(scene.sensors())
     names = [stem] if count == 1 else [f"{stem}_{index}" for index in range(count)]
     files = [f"{name}.{suffix}" for name in names for suffix in ("exr", "png")]
-    files += [ERROR_BUDGET] if error is not None else []
+    files += [ERROR_BUDGET] if splats is not None and splats.error is not None else []
     bitmaps = folder.claim(files, _render_sensors(path, scene))
     for name, bitmap in zip(names, bitmaps, strict=True):
         width, height = bitmap.size()
-        if error is not None:
-            folder.budget[:] = [scene.integrator().budget_report]
-            bitmap.metadata()[BUDGET_KEY] = json.dumps(folder.budget[0].record())
+        if splats is not None and splats.budget_report is not None:
+            folder.budget[:] = [splats.budget_report]
+            bitmap.metadata()[BUDGET_KEY] = json.dumps(splats.budget_report.record())
         write_exr(folder.path / f"{name}.exr", bitmap)
         # As floats: Mitsuba's own conversion to 8 bits rounds down.
         colors = bitmap.split()[0][1].convert(
@@ -391,8 +394,8 @@ def _render_sensors(path: Path, scene: mi.Scene) -> Iterator[mi.Bitmap]:
     try:
         if is_splats(integrator):
             print(integrator.summary(scene, *sensors), flush=True)
-            if integrator.budget_report is not None:
-                print(integrator.budget_report.line(), flush=True)
+            if integrator.state.budget_report is not None:
+                print(integrator.state.budget_report.line(), flush=True)
         for index, sensor in enumerate(sensors):
             integrator.render(scene, sensor=index)
             yield sensor.film().bitmap()

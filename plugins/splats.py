@@ -374,7 +374,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         if sensors := scene.sensors() or ([] if alone is None else [alone]):
             report = meet_error_budget(self.state, sensors, error)
             self.state.budget_report = report
-            mi.Log(mi.LogLevel.Info, report.line())
+            mi.Log(mi.LogLevel.Info, report.line())  # pyright: ignore[reportCallIssue]  no type
 
     def _check_derivatives(self, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode) -> None:
         if surfaces_in(scene):

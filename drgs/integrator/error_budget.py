@@ -287,7 +287,7 @@ def crop(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
     )
 
 
-def bound(errors: Sequence[float]) -> float:
+def bound(errors: Sequence[float] | np.ndarray) -> float:
     """Return the error that :data:`CONFIDENCE` of all views do not exceed, from those of some.
 
     Above their root mean square, errors are log-normal. Their spread is that of the views above it,
@@ -352,7 +352,7 @@ class Search:
         self._unordered = finest.of_views
         last = projected[-1], finest.level, DIRECTIONS[-1]
         best = {k: v for level in last for k, v in level.changes.items()}
-        self._references = self._in_windows(best | FINEST_CUT_OFFS)
+        self._references = self._in_windows({**best, **FINEST_CUT_OFFS})
 
     def _of_views(self, changes: Changes) -> list[np.ndarray]:
         """Return the images of the views, with the cheapest approximations but for ``changes``."""
@@ -451,7 +451,8 @@ def _front(given: Approximations, squares: Sequence[Sequence[LevelSquares]]) -> 
         changes = {k: v for each in levels for k, v in each.level.changes.items()}
         is_ordered = changes["order"] != "center"
         cost = math.prod(each.level.factor(is_ordered) for each in levels)
-        of_views, in_windows = (sum(terms) for terms in list(zip(*levels, strict=True))[1:])
+        of_views = np.sum([each.of_views for each in levels], axis=0)
+        in_windows = np.sum([each.in_windows for each in levels], axis=0)
         approximations = replace(given, **{k: v for k, v in changes.items() if k != SAMPLES})
         choice = Choice(approximations, changes, bound(np.sqrt(of_views)), cost)
         found.append(Combination(choice, of_views, in_windows))
@@ -524,7 +525,8 @@ def meet_error_budget(
     ]
     background = (0.0, 0.0, 0.0)
     if not isinstance(splats.background, mi.Texture):
-        background = tuple(float(v) for v in np.array(dr.detach(splats.background)).ravel()[:3])
+        red, green, blue = (float(v) for v in np.array(dr.detach(splats.background)).ravel())
+        background = red, green, blue
     try:
         with dr.suspend_grad():
             gaussians = dr.detach(splats.gaussians)

@@ -234,11 +234,14 @@ def test_viewers_show_images_within_the_budget(fit, capsys):
     assert found.gaussians is model.gaussians
 
 
-def test_mitsuba_scenes_are_rendered_within_the_budget(tmp_path):
-    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)))
-    run(path, "--error", 0.01, "--out", tmp_path / "out")
+@pytest.mark.parametrize(
+    ("words", "settings"), [(("--error", 0.01), ""), ((), '<string name="error" value="40 dB"/>')]
+)
+def test_mitsuba_scenes_are_rendered_within_the_budget(tmp_path, words, settings):
+    path = write_scene(tmp_path, sensor(pose_around(0.8, 0.3)), settings=settings)
+    run(path, *words, "--out", tmp_path / "out")
     record = json.loads((tmp_path / "out" / "error_budget.json").read_text())
-    assert record["budget"] == 0.01
+    assert record["budget"] == pytest.approx(0.01)
     with openexr_threads():
         metadata = mi.Bitmap(str(tmp_path / "out" / "blobs.exr")).metadata()
     assert json.loads(metadata["drgs error budget"]) == record
