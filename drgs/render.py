@@ -367,7 +367,7 @@ def render_mitsuba_scene(
     for name, bitmap in zip(names, bitmaps, strict=True):
         width, height = bitmap.size()
         if splats is not None and splats.budget_report is not None:
-            folder.budget[:] = [splats.budget_report]
+            folder.budget = splats.budget_report
             bitmap.metadata()[BUDGET_KEY] = json.dumps(splats.budget_report.record())
         write_exr(folder.path / f"{name}.exr", bitmap)
         # As floats: Mitsuba's own conversion to 8 bits rounds down.

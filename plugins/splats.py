@@ -22,7 +22,12 @@ from drgs.core.types import Bool
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.checks import surfaces_in
 from drgs.integrator.image_render import ImageRender
-from drgs.integrator.properties import check_object, nested_integrators, read_state
+from drgs.integrator.properties import (
+    check_object,
+    error_budget,
+    nested_integrators,
+    read_state,
+)
 from drgs.integrator.state import BackwardResult
 from drgs.splatting.rendering import ProjectionStage
 
@@ -223,12 +228,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     @property
     def error(self) -> float | None:
-        """Error budget, 0..1. May be set: the next rendering chooses approximations for it."""
+        """Error budget, 0..1; None: none. May be set: the next rendering chooses for it."""
         return self.state.error
 
     @error.setter
-    def error(self, budget: float | None) -> None:
-        self.state.error, self.state.budget_report = budget, None
+    def error(self, budget: float | str | None) -> None:
+        self.state.error, self.state.budget_report = error_budget(budget), None
 
     budget_report = property(attrgetter("state.budget_report"), doc="What ``error`` has chosen.")
     gaussians = property(attrgetter("state.gaussians"), doc="All rendered Gaussians, world space.")
@@ -373,7 +378,6 @@ class SplatsIntegrator(mi.CppADIntegrator):
         alone = self.state.cache.sensor
         if sensors := scene.sensors() or ([] if alone is None else [alone]):
             report = meet_error_budget(self.state, sensors, error)
-            self.state.budget_report = report
             mi.Log(mi.LogLevel.Info, report.line())  # pyright: ignore[reportCallIssue]  no type
 
     def _check_derivatives(self, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode) -> None:

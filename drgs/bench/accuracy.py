@@ -34,7 +34,7 @@ from drgs.datasets import load_dataset
 from drgs.datasets.types import View
 from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.error_budget import choose
+from drgs.integrator.error_budget import Renderer, Search
 from drgs.integrator.film import SamplePoints
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import rays as reference_rays
@@ -192,16 +192,11 @@ def rungs_of_budgets(subject: Subject, budgets: Sequence[float]) -> list[Rung]:
     """Return what error budgets choose for the subject's views; print each choice, or why not."""
     cameras = [device_camera(camera, llvm.Float) for camera in subject.cameras]
     gaussians, rungs = subject.gaussians.to(llvm.TensorXf), []
+    renderer = Renderer(gaussians, Approximations(), gaussians.sh_degree, subject.background)
+    search = Search(renderer, cameras)
     for budget in budgets:
         try:
-            report = choose(
-                gaussians,
-                cameras,
-                Approximations(),
-                gaussians.sh_degree,
-                subject.background,
-                budget,
-            )
+            report = search.choose(budget)
         except ValueError as refusal:
             print(f"error {refusal}")
             continue

@@ -74,11 +74,13 @@ def cut_offs(alpha_cut: float, transmittance_stop: float) -> Changes:
     return {"alpha_cut": alpha_cut, "transmittance_stop": transmittance_stop}
 
 
-COSTS_OF_WINDOWS = {1: 3.3, 4: 4.4, 8: 7.0, 16: 12.0, 32: 22.0}
 CENTER = Level({"order": "center"}, 1)
 WINDOWED = tuple(
-    Level({"order": "pixel", "order_window": k}, cost) for k, cost in COSTS_OF_WINDOWS.items()
+    Level({"order": "pixel", "order_window": window}, cost)
+    for window, cost in ((1, 3.3), (4, 4.4), (8, 7), (16, 12), (32, 22))
 )
+"""Costs are those of ``docs/results/accuracy.md``, rounded, as are those of the others."""
+
 DIRECTIONS = (Level({"sh_direction": "mean"}, 1), Level({"sh_direction": "pixel"}, 3, 1.6))
 CUT_OFFS = (
     Level(cut_offs(1 / 64, 1e-2), 0.87, 0.8),
@@ -86,7 +88,6 @@ CUT_OFFS = (
     Level(cut_offs(1 / 2048, 1e-6), 1.25, 1.45),
 )
 FINEST_CUT_OFFS = cut_offs(1e-5, 1e-7)
-"""The times are those of ``docs/results/accuracy.md``, rounded."""
 
 
 def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:
@@ -203,7 +204,7 @@ class Renderer:
     """Renders Gaussians with approximations that differ from given ones."""
 
     gaussians: Gaussians  # on the device
-    given: Approximations
+    given: Approximations  # their filters and falloff are kept
     sh_degree: int
     background: tuple[float, float, float]  # display space
 
@@ -324,14 +325,18 @@ class Combination(NamedTuple):
 
 
 class Search:
-    """Combinations of levels on some views, their predicted errors, and those measured."""
+    """Combinations of levels for some cameras, their predicted errors, and those measured."""
 
-    def __init__(self, renderer: Renderer, views: Sequence[MeasuredView], budget: float) -> None:
-        """Measure each level alone, and predict the errors of all combinations."""
-        self.budget, self._renderer, self._views = budget, renderer, views
+    def __init__(self, renderer: Renderer, cameras: Sequence[Camera]) -> None:
+        """Measure each level alone on some views, and predict the errors of all combinations."""
+        check_no_extensions(renderer.given)
+        self._started = time.perf_counter()
+        pixels = max(camera.width * camera.height for camera in cameras)
+        cameras = [cameras[k] for k in measured_places(len(cameras), pixels)]
+        views = [renderer.view(one, (k + 0.5) / len(cameras)) for k, one in enumerate(cameras)]
+        self._renderer, self._views = renderer, views
         self._whole: dict[frozenset, list[np.ndarray]] = {}
         self._windows: dict[frozenset, list[np.ndarray]] = {}
-        cameras = [view.camera for view in views]
         projected = projections(cameras)
         first = projected[0], CENTER, DIRECTIONS[0], CUT_OFFS[1]
         self._start = {k: v for level in first for k, v in level.changes.items()}
@@ -400,11 +405,36 @@ class Search:
             for level, found in zip((CENTER, *WINDOWED), squares, strict=True)
         ]
 
-    def correction(self, candidate: Combination) -> float:
+    def choose(self, budget: float) -> BudgetReport:
+        """Return the cheapest approximations whose error is within ``budget``.
+
+        Raises ValueError if no combination is.
+        """
+        place, of_views, errors = self.cheapest(budget)
+        pairs = zip(self.front, errors, strict=True)
+        front = [replace(one.choice, error=error) for one, error in pairs]
+        chosen, default, cameras = front[place], Approximations(), [v.camera for v in self._views]
+        usual = {name: getattr(default, name) for name in chosen.changes if name != SAMPLES}
+        times = [self._renderer.seconds(cameras[0], c) for c in (chosen.changes, usual)]
+        if chosen.shutter_samples is not None:
+            times[0] *= chosen.shutter_samples / own_samples(cameras)
+        return BudgetReport(
+            budget,
+            chosen,
+            tuple(of_views),
+            times[0] / times[1],
+            next((one for one in front[place:] if one.error < CLEARLY * chosen.error), None),
+            next((one for one in front[place::-1] if one.cost < CLEARLY * chosen.cost), None),
+            time.perf_counter() - self._started,
+        )
+
+    def correction(self, place: int) -> float:
         """Return the measured square error in the windows, relative to the sum of the levels'.
 
-        The errors of the most accurate image, and of the times of a shutter, are added.
+        place: in ``front``. The errors of the most accurate image, and of the times of a shutter,
+        are added.
         """
+        candidate = self.front[place]
         changes = {k: v for k, v in candidate.choice.changes.items() if k != SAMPLES}
         measured = self._differences(changes, self._references) + self._unordered
         if self._most_samples:
@@ -412,29 +442,29 @@ class Search:
             measured += self._differences(samples, self._in_windows(self._most_samples))
         return float(measured.sum() / max(candidate.in_windows.sum(), 1e-30))
 
-    def cheapest(self) -> tuple[int, list[float], list[float]]:
-        """Return the place in ``front`` of the cheapest choice within the budget.
+    def cheapest(self, budget: float) -> tuple[int, list[float], list[float]]:
+        """Return the place in ``front`` of the cheapest choice within a budget.
 
         Also the errors of its views, and those of all of ``front``. Sums are corrected by what was
         measured, of other choices by what was measured last. Raises ValueError if no choice is
         within the budget.
         """
-        corrections: dict[int, float] = {}
+        corrections: dict[int, float] = {}  # of this budget: the choice depends on no other one
         correction, last = 1.0, len(self.front) - 1
         while True:
             errors = [
                 bound(np.sqrt(corrections.get(k, correction) * candidate.of_views))
                 for k, candidate in enumerate(self.front)
             ]
-            place = next((k for k, error in enumerate(errors) if error <= self.budget), last)
+            place = next((k for k, error in enumerate(errors) if error <= budget), last)
             if place not in corrections:
-                correction = corrections[place] = self.correction(self.front[place])
-            elif errors[place] <= self.budget:
+                correction = corrections[place] = self.correction(place)
+            elif errors[place] <= budget:
                 of_views = np.sqrt(corrections[place] * self.front[place].of_views)
                 return place, of_views.tolist(), errors
             else:
                 raise ValueError(
-                    f"{self.budget:.2g} cannot be met here: the most accurate choice is within "
+                    f"{budget:.2g} cannot be met here: the most accurate choice is within "
                     f"{_rounded_up(errors[place])}"
                 )
 
@@ -463,50 +493,14 @@ def _front(given: Approximations, squares: Sequence[Sequence[LevelSquares]]) -> 
     return front
 
 
-def choose(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    given: Approximations,
-    sh_degree: int,
-    background: tuple[float, float, float],
-    budget: float,
-) -> BudgetReport:
-    """Return the cheapest approximations whose error is within ``budget``, and their neighbours.
-
-    gaussians: on the device; cameras: those of the render, from which some are taken; given:
-    approximations whose filters and falloff are kept.
-
-    Raises ValueError if no combination is within the budget, or parts are extensions.
-    """
+def check_no_extensions(given: Approximations) -> None:
+    """Raise ValueError for a projection, falloff or order of another package."""
     for registry in (PROJECTIONS, FALLOFFS, ORDERS):
         if (value := getattr(given, registry.kind)) not in registry.shipped_names:
             raise ValueError(
                 f"cannot be met with the {registry.kind} '{value}', which is not drgs's own: what "
                 "is accurate, is not known; leave one of them out"
             )
-    started = time.perf_counter()
-    renderer = Renderer(gaussians, given, sh_degree, background)
-    pixels = max(camera.width * camera.height for camera in cameras)
-    measured = [cameras[k] for k in measured_places(len(cameras), pixels)]
-    views = [renderer.view(one, (k + 0.5) / len(measured)) for k, one in enumerate(measured)]
-    search = Search(renderer, views, budget)
-    place, of_views, errors = search.cheapest()
-    pairs = zip(search.front, errors, strict=True)
-    front = [replace(one.choice, error=error) for one, error in pairs]
-    chosen, default = front[place], Approximations()
-    usual = {name: getattr(default, name) for name in chosen.changes if name != SAMPLES}
-    times = [renderer.seconds(measured[0], changes) for changes in (chosen.changes, usual)]
-    if chosen.shutter_samples is not None:
-        times[0] *= chosen.shutter_samples / own_samples(measured)
-    return BudgetReport(
-        budget,
-        chosen,
-        tuple(of_views),
-        times[0] / times[1],
-        next((one for one in front[place:] if one.error < CLEARLY * chosen.error), None),
-        next((one for one in front[place::-1] if one.cost < CLEARLY * chosen.cost), None),
-        time.perf_counter() - started,
-    )
 
 
 def meet_error_budget(
@@ -529,12 +523,10 @@ def meet_error_budget(
         background = red, green, blue
     try:
         with dr.suspend_grad():
-            gaussians = dr.detach(splats.gaussians)
-            report = choose(
-                gaussians, cameras, splats.approximations, splats.sh_degree, background, budget
-            )
+            gaussians, given = dr.detach(splats.gaussians), splats.given_approximations
+            renderer = Renderer(gaussians, given, splats.sh_degree, background)
+            report = Search(renderer, cameras).choose(budget)
     except ValueError as error:
         raise PluginError(f"splats: error {error}") from None
-    splats.approximations = report.chosen.approximations
-    splats.shutter_samples = report.chosen.shutter_samples
+    splats.budget_report = report
     return report

@@ -187,10 +187,10 @@ def read_state(
         nested=next(iter(nested), None),
         default_degree=max(one.gaussians.sh_degree for one in every.values()),
         given_degree=settings.pop("sh_degree"),
-        approximations=Approximations(**{**header, **read(props, given)}),
+        given_approximations=Approximations(**{**header, **read(props, given)}),
         header=header,
         aovs=_aovs(props, [*AOVS, *feature_widths(every)]),
-        error=_error(props),
+        error=error_budget(props.get("error")),
         ignore=_words(props, "ignore"),
         probes=_words(props, "probes"),
         shadows=_words(props, "shadows"),
@@ -220,12 +220,12 @@ def _check_settings(state: SplatsState) -> None:
             )
 
 
-def _error(props: mi.Properties) -> float | None:
-    """Return the error budget; a number, or text with a unit."""
-    if "error" not in props:
+def error_budget(value: object) -> float | None:
+    """Return an error budget given as a number, or as text with a unit; None: none."""
+    if value is None:
         return None
     try:
-        return parse_error(props["error"])
+        return parse_error(value)
     except ValueError as error:
         raise PluginError(f"splats: error {error}") from None
 

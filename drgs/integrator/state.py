@@ -125,7 +125,7 @@ class SplatsState:
     nested: mi.SamplingIntegrator | None  # of surfaces
     default_degree: int  # of spherical harmonics, where the scene has no other Gaussians
     given_degree: int | None  # None: the highest that the Gaussians have
-    approximations: Approximations
+    given_approximations: Approximations
     header: dict[str, Value]  # the approximations that files' headers set
     near: float  # scene units
     aovs: dict[str, str]  # types by name
@@ -140,7 +140,6 @@ class SplatsState:
     shadows: Sequence[str]
     exposure: float
     error: float | None  # budget of the approximations' error; None: as they are given
-    shutter_samples: int | None = None  # that the budget has chosen; None: each sensor's own
     budget_report: Any = None  # drgs.integrator.error_budget.BudgetReport, once it was met
     cache: RenderCache = field(default_factory=RenderCache)
     projection: rendering.ProjectionStage = field(default_factory=rendering.Projected)
@@ -175,6 +174,18 @@ class SplatsState:
         if gathered is not None and gathered.gaussians.smoothing is not None:
             pipeline = replace(pipeline, of_smoothing=True)  # it scales with an object
         return replace(pipeline, source=self.projection)
+
+    @property
+    def approximations(self) -> Approximations:
+        """The approximations that are rendered with: given ones, or those within the error."""
+        report = self.budget_report
+        return self.given_approximations if report is None else report.chosen.approximations
+
+    @property
+    def shutter_samples(self) -> int | None:
+        """Times of open shutters within the error; None: each sensor's own."""
+        report = self.budget_report
+        return None if report is None else report.chosen.shutter_samples
 
     def aov_names(self) -> list[str]:
         """Return the names of the channels besides colour and alpha."""

@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -55,24 +55,24 @@ PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr"
 Image = TypeVar("Image")
 
 
-@dataclass(frozen=True)
+@dataclass
 class ImageFolder:
     """An output folder of images; see :func:`open_image_folder`."""
 
     path: Path
     keep: Callable[[], object]  # see :func:`drgs.core.folders.sole_writer`
-    budget: list[BudgetReport] = field(default_factory=list)  # of the images: one, or none
+    budget: BudgetReport | None = None  # of the images
 
     def write_png(self, name: str, image: np.ndarray) -> None:
         """Write a claimed image, with the approximations that an error budget has chosen."""
-        text = [(BUDGET_KEY, json.dumps(one.record())) for one in self.budget]
-        write_png(self.path / name, image, dict(text))
+        text = {} if self.budget is None else {BUDGET_KEY: json.dumps(self.budget.record())}
+        write_png(self.path / name, image, text)
 
     def write_budget(self) -> None:
         """Write what an error budget has chosen, if there is one."""
-        for one in self.budget:
+        if self.budget is not None:
             with atomic_path(self.path / ERROR_BUDGET) as temporary:
-                temporary.write_text(json.dumps(one.record(), indent=2) + "\n")
+                temporary.write_text(json.dumps(self.budget.record(), indent=2) + "\n")
 
     def claim(self, names: Iterable[str], images: Iterable[Image]) -> Iterator[Image]:
         """Yield the images after claiming the files ``names``.
@@ -150,7 +150,7 @@ class Model:
         print(format_effects(summary), flush=True)
         names = [*(f"{view.name}.png" for view in views), *others]
         if self.error is not None:
-            folder.budget.append(self.meet_error_budget(integrator.state, views))
+            folder.budget = self.meet_error_budget(integrator.state, views)
             names.append(ERROR_BUDGET)
         return folder.claim(names, self.render(scene, views))
 

@@ -130,14 +130,7 @@ def study(subject: Subject) -> list[list[str]]:
     for budget in BUDGETS:
         cheapest = min((cost for cost, error in oracle if error <= budget), default=math.nan)
         try:
-            report = budgets.choose(
-                subject.gaussians,
-                subject.cameras,
-                subject.given,
-                degree,
-                subject.background,
-                budget,
-            )
+            report = budgets.Search(renderer, subject.cameras).choose(budget)
         except ValueError as refusal:
             rows.append([subject.name, f"{budget:g}", str(refusal), "", "", "", ""])
             continue
