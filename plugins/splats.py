@@ -24,8 +24,8 @@ from drgs.integrator.checks import surfaces_in
 from drgs.integrator.image_render import ImageRender
 from drgs.integrator.properties import (
     check_object,
-    error_budget,
     nested_integrators,
+    parse_budget,
     read_state,
 )
 from drgs.integrator.state import BackwardResult
@@ -233,7 +233,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     @error.setter
     def error(self, budget: float | str | None) -> None:
-        self.state.error, self.state.budget_report = error_budget(budget), None
+        self.state.error, self.state.budget_report = parse_budget(budget), None
 
     budget_report = property(attrgetter("state.budget_report"), doc="What ``error`` has chosen.")
     gaussians = property(attrgetter("state.gaussians"), doc="All rendered Gaussians, world space.")

@@ -190,7 +190,7 @@ def read_state(
         given_approximations=Approximations(**{**header, **read(props, given)}),
         header=header,
         aovs=_aovs(props, [*AOVS, *feature_widths(every)]),
-        error=error_budget(props.get("error")),
+        error=parse_budget(props.get("error")),
         ignore=_words(props, "ignore"),
         probes=_words(props, "probes"),
         shadows=_words(props, "shadows"),
@@ -220,7 +220,7 @@ def _check_settings(state: SplatsState) -> None:
             )
 
 
-def error_budget(value: object) -> float | None:
+def parse_budget(value: object) -> float | None:
     """Return an error budget given as a number, or as text with a unit; None: none."""
     if value is None:
         return None
