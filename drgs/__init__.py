@@ -7,8 +7,8 @@
 >>> image, alpha, _ = drgs.rasterization(means, quats, scales, opacities, colors, ...)
 
 :class:`Gaussians` is a scene, :func:`load_dataset` reads photographs with their cameras,
-:func:`train` fits Gaussians to them, and :func:`rasterization` renders differentiably.
-:data:`EXAMPLE` is the file of a fitted crane truck.
+:func:`examine` tells which effects they call for, :func:`train` fits Gaussians to them, and
+:func:`rasterization` renders differentiably. :data:`EXAMPLE` is the file of a fitted crane truck.
 
 Importing ``drgs`` registers Mitsuba's plugins ``splats`` and ``calibrated`` for the active variant
 and for every later one. Public names are imported when they are first used.
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from drgs.datasets import load_dataset
     from drgs.gaussians.parameters import Gaussians
     from drgs.gsplat_api import rasterization
+    from drgs.training.examination import examine
     from drgs.training.session import train
 
 __version__ = "0.1.0"
@@ -34,7 +35,7 @@ __version__ = "0.1.0"
 EXAMPLE = Path(__file__).with_name("brick_crane.compressed.ply")
 """File of a fitted crane truck, for a first look: ``drgs.Gaussians.load(drgs.EXAMPLE)``."""
 
-__all__ = ["EXAMPLE", "Gaussians", "load_dataset", "rasterization", "train"]
+__all__ = ["EXAMPLE", "Gaussians", "examine", "load_dataset", "rasterization", "train"]
 
 # Dr.Jit loads its libLLVM while it is being imported: this comes before anything that does.
 llvm.select_newest_llvm()
@@ -45,6 +46,7 @@ errors.show_causes_last()
 
 _MODULES = {
     "Gaussians": "drgs.gaussians.parameters",
+    "examine": "drgs.training.examination",
     "load_dataset": "drgs.datasets",
     "rasterization": "drgs.gsplat_api",
     "train": "drgs.training.session",

@@ -13,6 +13,7 @@ from drgs.core.environment import describe_installation
 
 COMMANDS = {
     "fit": Subcommand("fit 3D Gaussians to posed photographs", "drgs.fit"),
+    "examine": Subcommand("find out which effects photographs call for", "drgs.examination"),
     "poses": Subcommand("find out where photographs were taken", "drgs.poses.__main__"),
     "render": Subcommand("render Gaussians, a fit, or a Mitsuba scene", "drgs.render"),
     "export": Subcommand("write Gaussians for other programs", "drgs.export"),

@@ -1,7 +1,7 @@
 """``python -m drgs.export RUN_OR_FILE --format NAME``: Gaussians for other programs.
 
 Exports a file, or a fit's file for other programs (``drgs.training.viewers``), in the formats of
-``drgs.io.formats``; crops, filters and turns it upright.
+``drgs.io.formats``; crops, filters, decimates and turns it upright.
 """
 
 from __future__ import annotations
@@ -10,26 +10,38 @@ import argparse
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from drgs.cli.commands import CommandParser, file_or_folder, finite_number, run_command
+from drgs.cleaning import add_cleaning_arguments, clean, reduce_to
+from drgs.cli.commands import (
+    CommandParser,
+    bounded_int,
+    file_or_folder,
+    run_command,
+)
+from drgs.cli.execution import select_variant
 from drgs.config.approximations import DECLARED, Approximations, from_ply_header
+from drgs.config.schema import ModelConfig
 from drgs.core.constants import LOW_PASS
+from drgs.core.environment import require_module
 from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
 from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord
 from drgs.core.registry import HOW_TO_INSTALL
-from drgs.datasets.orbits import up_of
+from drgs.datasets.orbits import near_plane_of, rings_around, up_of
 from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.similarity import rotation_towards
-from drgs.io.formats import file_formats, format_for
+from drgs.gaussians.selection import take
+from drgs.gaussians.similarity import rotation_towards, shortest_rotation
+from drgs.io import sog
+from drgs.io.formats import format_for, writable_formats
 from drgs.io.quantization import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
+from drgs.results.levels import LOD_META, encode_levels
 from drgs.results.refined_cameras import training_cameras
 from drgs.results.viewer import HONOURED, DisplaySettings, InitialView, viewer_page
 
@@ -39,6 +51,12 @@ Z_UP = np.array([0.0, 0.0, 1.0])  # of datasets, and of Gaussians that formats w
 Y_DOWN = np.array([0.0, -1.0, 0.0])  # of formats without axes: COLMAP's, hence the reference's
 
 PLAYCANVAS_LOW_PASS = 0.075  # px^2, of PlayCanvas and SuperSplat; others add 0.3
+
+PLAYCANVAS = ("compressed-ply", "sog")  # formats that are read by them
+
+NUM_LEVELS = (2, 8)
+
+MESH_SIZE, MESH_SIZES = 256, (16, 2048)  # voxels along the longest side: default, range
 
 MIN_SNAP_COSINE = np.cos(np.radians(5))  # angle below which the cameras' up is snapped to an axis
 
@@ -50,7 +68,9 @@ class ExportSource:
     gaussians: Gaussians[np.ndarray]  # without a smoothing filter
     path: Path  # of the file
     folder: Path | None  # of the fit; None: a file was named
-    is_turned: bool = False  # then the fit's cameras no longer match
+    rotation: np.ndarray | None = None  # (3, 3) that the Gaussians were turned by, not the cameras
+    mesh_size: int = MESH_SIZE
+    suffix: str = ""  # of the output, in small letters
 
 
 Honoured = Callable[[Approximations], frozenset[str]]
@@ -83,11 +103,11 @@ def targets() -> dict[str, ExportTarget]:
             encode=lambda source, name=each.name: source.gaussians.to_bytes(name),
             up=Y_DOWN if each.value.up is None else Z_UP,
             has_axes=each.value.up is not None,
-            honoured=_honoured_by_playcanvas if each.name == "compressed-ply" else None,
+            honoured=_honoured_by_playcanvas if each.name in PLAYCANVAS else None,
         )
-        for each in file_formats()
+        for each in writable_formats()
     }
-    return {**found, "html": PAGE}
+    return {**found, "html": PAGE, "mesh": MESH}
 
 
 def _page(source: ExportSource) -> bytes:
@@ -97,7 +117,7 @@ def _page(source: ExportSource) -> bytes:
     if folder is not None:
         title = folder.resolve().name
         background = load_run_config(folder).data.background_rgb
-        cameras = None if source.is_turned else training_cameras(folder, gaussians.origin)
+        cameras = training_cameras(folder, gaussians.origin) if source.rotation is None else None
     if cameras is not None:
         initial_view = InitialView.from_views(cameras, gaussians)
     else:
@@ -108,6 +128,36 @@ def _page(source: ExportSource) -> bytes:
 
 _PAGE_TEXT = "a page to walk around in, for any browser"
 PAGE = ExportTarget(".html", _PAGE_TEXT, _page, Z_UP, honoured=lambda _: HONOURED)
+
+
+def _mesh(source: ExportSource) -> bytes:
+    """Encode the surface that the fit's training cameras see; for a file, cameras around it."""
+    from drgs.results import surface
+
+    for module in surface.MODULES:  # before anything is rendered
+        require_module(module, "mesh", "--format mesh")
+    gaussians, folder, turn = source.gaussians, source.folder, np.eye(4)
+    turn[:3, :3] = np.eye(3) if source.rotation is None else source.rotation
+    if folder is None:
+        near, cameras = near_plane_of(gaussians), None
+    else:
+        x, y, z = (turn[:3, :3].T @ gaussians.origin).tolist()
+        near, cameras = load_run_config(folder).model.near, training_cameras(folder, (x, y, z))
+    if cameras is None:
+        cameras = rings_around(gaussians, Z_UP, surface.VIEWS_PER_RING, surface.RING_SIDE_PX)
+    else:
+        cameras = [replace(v, camera_to_world=turn @ v.camera_to_world) for v in cameras]
+    recorded = from_ply_header(str(source.path), gaussians.rendered_with or {})
+    model = ModelConfig(near=near).with_3dgs_defaults().model_copy(update=recorded)
+    images = list(surface.depth_images(gaussians, model, cameras))
+    mesh = surface.mesh_of(images, source.mesh_size)
+    print(f"{len(images)} views: {len(mesh.faces):,} triangles")
+    encode = surface.encode_glb if source.suffix == ".glb" else surface.encode_ply
+    return encode(mesh, gaussians.origin)
+
+
+_MESH_TEXT = "the surface as triangles with colours (.ply or .glb)"
+MESH = ExportTarget(".ply", _MESH_TEXT, _mesh, Z_UP, honoured=lambda _: frozenset(DECLARED))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -122,6 +172,8 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s out/lego --format spz",
         "%(prog)s out/lego --out lego.glb --min-opacity 0.02",
         "%(prog)s model.ply --up 0 -1 0 --out model.spz",
+        "%(prog)s out/lego --format mesh --out lego.glb",
+        "%(prog)s out/lego --levels 4 --out web/lod-meta.json",
     )
     parser.add_argument(
         "what",
@@ -139,27 +191,21 @@ def add_arguments(parser: CommandParser) -> None:
         metavar="FILE",
         help="output file (default: the name of the input, with the suffix of the format)",
     )
-    _add_cleaning(parser)
-    parser.set_defaults(run=run)
-
-
-def _add_cleaning(parser: CommandParser) -> None:
-    add = parser.add_argument_group("selection and orientation").add_argument
-    corners = tuple(f"{axis}{end}" for end in "01" for axis in "XYZ")
-    add(
-        "--crop",
-        type=finite_number,
-        nargs=6,
-        metavar=corners,
-        help="keep the Gaussians inside a box",
+    parser.add_argument(
+        "--mesh-size",
+        type=bounded_int(*MESH_SIZES),
+        metavar="N",
+        help=f"voxels along the longest side of a mesh (default: {MESH_SIZE})",
     )
-    add("--min-opacity", type=_opacity, metavar="P", help="remove less opaque Gaussians, 0 to 1")
-    add(
-        "--max-size",
-        type=_size,
-        metavar="S",
-        help="remove Gaussians with a larger standard deviation, scene units",
+    parser.add_argument(
+        "--levels",
+        type=bounded_int(*NUM_LEVELS),
+        metavar="N",
+        help=f"levels of detail, each of half as many Gaussians as the one before (see "
+        f"--decimate), as PlayCanvas streams them: {LOD_META} beside folders of SOG",
     )
+    add_cleaning_arguments(parser)
+    add = parser.add_argument_group("orientation and order").add_argument
     add(
         "--up",
         nargs="+",
@@ -175,40 +221,47 @@ def _add_cleaning(parser: CommandParser) -> None:
         help="morton: sort along a space-filling curve (default: order of the input, or of the "
         "format)",
     )
-
-
-def _opacity(text: str) -> float:
-    if not 0 <= (number := finite_number(text)) <= 1:
-        raise argparse.ArgumentTypeError(f"must be between 0 and 1, got {text}")
-    return number
-
-
-def _size(text: str) -> float:
-    if not (number := finite_number(text)) > 0:
-        raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
-    return number
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:
     """Export the model of the command line."""
-    name, out = _destination(args)
-    target = targets()[name]
+    target, out = _destination(args)
     source = load_source(args.what, target.honoured)
     if out.resolve() == source.path.resolve():
         raise UserError(f"--out {out}: is the input; choose another name")
     print(f"{source.path}: {source.gaussians.num_gaussians:,} Gaussians", flush=True)
+    coarse = [f"{level}_0/{sog.META}" for level in range(args.levels or 0)]
+    FolderRecord(out.parent, COMMAND).check([*coarse, out.name])
     up = _up_direction(args, source, target)
-    gaussians = _select(source, args)
+    gaussians = clean(source.gaussians, source.path, args)
+    if args.decimate is not None or args.levels is not None or target.encode is _mesh:
+        select_variant(args.variant)
+    axis = Z_UP if up is None else up
+    if args.decimate is not None:
+        count = args.decimate(gaussians.num_gaussians)
+        gaussians = reduce_to(gaussians, count, source.folder, axis)
+    counts = [-(-gaussians.num_gaussians // 2**k) for k in range(1, args.levels or 1)]
+    levels = [gaussians, *(reduce_to(gaussians, count, source.folder, axis) for count in counts)]
     if up is not None:
-        gaussians = rotation_towards(gaussians, up, target.up)
+        levels = [rotation_towards(each, up, target.up) for each in levels]
+        source = replace(source, rotation=shortest_rotation(up, target.up))
     if args.order == "morton":
-        gaussians = take(gaussians, morton_order(gaussians.means))
-    content = target.encode(replace(source, gaussians=gaussians, is_turned=up is not None))
-    FolderRecord(out.parent, COMMAND).claim([out.name])
-    with atomic_path(out) as temporary:
-        temporary.write_bytes(content)
+        levels = [take(each, morton_order(each.means)) for each in levels]
+    if args.levels is not None:
+        files = encode_levels(levels)
+    else:
+        output = {"mesh_size": args.mesh_size or MESH_SIZE, "suffix": out.suffix.lower()}
+        content = target.encode(replace(source, gaussians=levels[0], **output))
+        files = sog.unpack(content) if _is_named(out, sog.META) else {out.name: content}
+    if source.path.resolve() in {(out.parent / path).resolve() for path in files}:
+        raise UserError(f"--out {out}: would replace {source.path}, the input; choose another name")
+    FolderRecord(out.parent, COMMAND).claim(files)
+    for path, content in files.items():
+        with atomic_path(out.parent / path) as temporary:
+            temporary.write_bytes(content)
     FolderRecord(out.parent, COMMAND).seal()
-    print(f"written: {out} ({len(content) / 1e6:.1f} MB)")
+    print(f"written: {out} ({sum(map(len, files.values())) / 1e6:.1f} MB)")
 
 
 def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
@@ -247,75 +300,60 @@ def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
     return ExportSource(gaussians, path, what if what.is_dir() else None)
 
 
-def _destination(args: argparse.Namespace) -> tuple[str, Path]:
-    name = args.format
+def _destination(args: argparse.Namespace) -> tuple[ExportTarget, Path]:
+    _check_levels(args)
+    name = args.format or (None if args.levels is None else "sog")
     if name is None and args.out is not None:
         name = _target_name(args.out)
     known = targets()
     if name not in known:
         got = f"got {one_line(name, 40)}{did_you_mean(name, known)}" if name else "got none"
         raise UserError(f"--format: must be one of {', '.join(known)}, {got}; {HOW_TO_INSTALL}")
-    suffix = known[name].suffix
+    target = known[name]
+    if name != "mesh" and args.mesh_size is not None:
+        raise UserError(f"--mesh-size: is for --format mesh, got {name}; leave it out")
     if args.out is None:
         read_as = format_for(args.what)
-        stem = args.what.name[: -len(read_as.value.suffix)] if read_as else args.what.resolve().name
-        return name, args.what.resolve().with_name(f"{stem}{suffix}")
-    if (found := _target_name(args.out)) != name:  # as a.compressed.ply is no name for a plain PLY
+        place = args.what.resolve()
+        place = place.parent if _is_named(place, sog.META) else place
+        stem = args.what.name[: -len(read_as.value.suffix)] if read_as else place.name
+        if args.levels is not None:
+            return target, place.with_name(f"{stem}_levels") / LOD_META
+        return target, place.with_name(f"{stem}{target.suffix}")
+    found = _target_name(args.out)  # as a.compressed.ply is no name for a plain PLY
+    if name == "mesh" and found in ("ply", "glb"):
+        return replace(target, has_axes=found == "glb"), args.out
+    if found != name:
+        ends = ".ply or .glb" if name == "mesh" else target.suffix
         raise UserError(
-            f"--out {args.out}: the name of a {name} file must end in {suffix}, got that of "
+            f"--out {args.out}: the name of a {name} file must end in {ends}, got that of "
             f"{f'a {found}' if found else 'no known'} file"
         )
-    return name, args.out
+    return target, args.out
+
+
+def _is_named(path: Path, name: str) -> bool:
+    return path.name.lower() == name
+
+
+def _check_levels(args: argparse.Namespace) -> None:
+    is_named = args.out is not None and _is_named(args.out, LOD_META)
+    if args.levels is None and is_named:
+        raise UserError(f"--out {args.out}: is a file of levels of detail; give --levels N")
+    if args.levels is not None and (args.format or "sog") != "sog":
+        got = one_line(args.format, 40)
+        raise UserError(f"--levels: writes SOG, got --format {got}; leave it out")
+    if args.levels is not None and args.out is not None and not is_named:
+        raise UserError(f"--levels: writes a file named {LOD_META}, got --out {args.out}")
 
 
 def _target_name(path: Path) -> str | None:
     if path.name.lower().endswith(PAGE.suffix):
         return "html"
+    if _is_named(path, sog.META) or _is_named(path, LOD_META):
+        return "sog"
     found = format_for(path)
     return None if found is None else found.name
-
-
-def find_kept(
-    gaussians: Gaussians[np.ndarray],
-    box: Sequence[float] | None = None,
-    min_opacity: float | None = None,
-    max_scale: float | None = None,
-) -> dict[str, np.ndarray]:
-    """Return the mask (N,) of the Gaussians that each given criterion keeps.
-
-    box: two opposite corners, world, of the means; max_scale: standard deviation, world units.
-    """
-    kept = {}
-    if box is not None:
-        corners = np.reshape(box, (2, 3))
-        means = gaussians.means.astype(np.float64) + gaussians.origin
-        inside = (means >= corners.min(axis=0)) & (means <= corners.max(axis=0))
-        kept["box"] = inside.all(axis=1)
-    if min_opacity is not None:
-        kept["opacity"] = gaussians.opacities >= min_opacity
-    if max_scale is not None:
-        kept["size"] = gaussians.scales.max(axis=1) <= max_scale
-    return kept
-
-
-def take(gaussians: Gaussians[np.ndarray], rows: np.ndarray) -> Gaussians[np.ndarray]:
-    """Return some of the Gaussians; rows: indices, or a mask (N,)."""
-    values = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
-    arrays = {name: v[rows] for name, v in values.items() if isinstance(v, np.ndarray)}
-    features = gaussians.features and {k: v[rows] for k, v in gaussians.features.items()}
-    return replace(gaussians, **arrays, features=features)
-
-
-def _select(source: ExportSource, args: argparse.Namespace) -> Gaussians[np.ndarray]:
-    found = find_kept(source.gaussians, args.crop, args.min_opacity, args.max_size)
-    if not found:
-        return source.gaussians
-    kept = np.logical_and.reduce(list(found.values()))
-    lost = ", ".join(f"{name} {np.count_nonzero(~k):,}" for name, k in found.items())
-    print(f"kept: {np.count_nonzero(kept):,}; left out by {lost}", flush=True)
-    if not kept.any():
-        raise UserError(f"{source.path}: nothing is left; crop and filter less")
-    return take(source.gaussians, kept)
 
 
 def _up_direction(

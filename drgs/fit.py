@@ -6,6 +6,7 @@ Runs :class:`drgs.training.session.FitSession` with a given or a default configu
 from __future__ import annotations
 
 import argparse
+import json
 import signal
 import sys
 import time
@@ -34,6 +35,8 @@ from drgs.training.session import FitSession
 
 if TYPE_CHECKING:  # imported with --view
     from drgs.viewer.server import LocalServer
+
+MIN_EXAMINED_SECONDS = 100  # of a --budget: an examination takes 8 to 25 s
 
 LOADING_SECONDS = 1.2  # before run(), for imports; --budget includes them
 
@@ -70,13 +73,13 @@ def add_arguments(parser: CommandParser) -> None:
     parser.add_argument(
         "--overwrite", action="store_true", help="replace an earlier run in the output folder"
     )
+    parser.add_overrides("override a value of the configuration, as in densify.every=200")
     parser.add_argument(
-        "--set",
-        dest="overrides",
+        "--leave-out",
         action="append",
         default=[],
-        metavar="KEY=VALUE",
-        help="override a value of the configuration, as in densify.every=200; repeatable",
+        metavar="NAME",
+        help="photograph that is not used (data.leave_out), by its file name; repeatable",
     )
     parser.add_argument(
         "--budget",
@@ -131,12 +134,25 @@ def run(args: argparse.Namespace) -> None:
             require_module("tensorboardX", "tensorboard", "--tensorboard")
         session.config, out = read_inputs(args)
         session.folder = FitFolder(out, args.command, args.resume is not None, args.overwrite)
+        if args.config is not None and args.config.is_dir():
+            choose_effects(session, session.config, session.folder)
         session.uses_terminal = True
         session.on_start = partial(add_observers, args, server, blocks)
         finished = session.run()
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")
         sys.exit(INTERRUPTED_STATUS)
+
+
+def choose_effects(session: FitSession, config: FitConfig, folder: FitFolder) -> None:
+    """Let the session examine the dataset, unless an earlier run in its folder has."""
+    examined = folder.with_examination(config)
+    if examined is not None:
+        session.config = examined
+    elif session.budget is not None and session.budget.seconds < MIN_EXAMINED_SECONDS:
+        print(f"not examined: --budget is less than {MIN_EXAMINED_SECONDS} s")
+    else:
+        session.examines = True
 
 
 def communicator(args: argparse.Namespace) -> Communicator:
@@ -192,14 +208,16 @@ def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:
     """Return the configuration that the command line specifies, and the output folder."""
     data = [] if args.data is None else [f"data.path={args.data}"]
     if args.resume is not None:
-        if args.out is not None or args.overrides or args.overwrite or args.budget is not None:
+        given = args.out is not None, args.budget is not None, args.overwrite, args.leave_out
+        if args.overrides or any(given):
             raise UserError(
                 f"--resume: takes its configuration from {args.resume / CONFIG}: leave out --out, "
-                "--set, --budget and --overwrite"
+                "--set, --leave-out, --budget and --overwrite"
             )
         return load_moved_config(args.resume, data), args.resume
     out = [] if args.out is None else [f"output.dir={args.out}"]
-    overrides = args.overrides + data + out
+    left_out = [f"data.leave_out={json.dumps(args.leave_out)}"] if args.leave_out else []
+    overrides = args.overrides + left_out + data + out
     if args.config.is_dir():
         if data:
             raise UserError(f"--data: {args.config} is a folder already; leave one of them out")

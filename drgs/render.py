@@ -42,11 +42,18 @@ from drgs.core.processes import process_number, start_mpi
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
 from drgs.datasets.types import Viewpoint
-from drgs.datasets.viewpoints import FIELD_OF_VIEW, field_of_view, look_at, pinhole, read_viewpoints
+from drgs.datasets.viewpoints import (
+    FIELD_OF_VIEW,
+    field_of_view,
+    look_at,
+    panorama,
+    pinhole,
+    read_viewpoints,
+)
 from drgs.effects.compose import IGNORABLE
 from drgs.integrator.scene import render_views
 from drgs.integrator.types import is_splats
-from drgs.io.formats import format_for, readable_formats
+from drgs.io.formats import format_to_read, readable_formats
 from drgs.io.images import (
     MITSUBA_FORMATS,
     check_animation,
@@ -69,16 +76,18 @@ from drgs.results.model import (
 )
 from drgs.results.refined_cameras import training_cameras
 
-DEFAULT_SIZE = (400, 400)  # px, where nothing else decides how large an image is
+DEFAULT_SIZE, PANORAMA_SIZE = (400, 400), (800, 400)
+"""Width and height, px, where nothing else decides how large an image is."""
+
 UP = (0.0, 0.0, 1.0)  # world: the convention of both dataset layouts
 
 MAX_FRAMES = 10_000  # of an orbit: all cameras are created first
 
 CAMERA_OPTIONS = {
     "split": set(),
-    "orbit": {"up", "fov", "size"},
-    "camera": {"size"},
-    "origin": {"target", "up", "fov", "size"},
+    "orbit": {"up", "fov", "size", "panorama"},
+    "camera": {"size", "panorama"},
+    "origin": {"target", "up", "fov", "size", "panorama"},
 }
 """Options that each way of placing cameras uses."""
 
@@ -102,6 +111,7 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s out/lego --out DIR                # the test views, with PSNR and SSIM",
         "%(prog)s out/lego --orbit 60 --out DIR     # an animation",
         "%(prog)s model.ply --origin 0 -3 2 --target 0 0 0 --out DIR",
+        "%(prog)s out/fox --orbit 60 --panorama --out DIR",
         "%(prog)s scene.xml -D model=model.ply --out DIR",
     )
     parser.add_argument(
@@ -165,7 +175,14 @@ def _add_cameras(parser: CommandParser) -> None:
         type=bounded_int(1),
         nargs=2,
         metavar=("W", "H"),
-        help="px (default: 400 400; for --orbit, at most that, in the photographs' proportions)",
+        help="px (default: 400 400; for --orbit, at most that, in the photographs' proportions; "
+        "800 400 for --panorama)",
+    )
+    add(
+        "--panorama",
+        action="store_const",
+        const=True,
+        help="images in all directions (equirectangular) from these positions",
     )
 
 
@@ -290,14 +307,17 @@ def render_split(model: Model, split: str, folder: ImageFolder) -> Quality:
 def render_orbit(model: Model, args: argparse.Namespace, folder: ImageFolder) -> None:
     """Render frames around the scene, and animations of them."""
     if model.config is None:
-        fov, (width, height) = args.fov or FIELD_OF_VIEW, args.size or DEFAULT_SIZE
+        fov, (width, height) = args.fov or FIELD_OF_VIEW, args.size or _default_size(args)
         orbit = orbit_of_gaussians(model.gaussians, np.array(args.up or UP), fov)
     else:
         views = _orbited_views(model, model.config, args)
-        fov, (width, height) = args.fov or field_of_view(views), args.size or orbit_size(views)
+        size = PANORAMA_SIZE if args.panorama else orbit_size(views)
+        fov, (width, height) = args.fov or field_of_view(views), args.size or size
         orbit = orbit_of_views(views, model.gaussians)
     check_animation(args.orbit, width, height)
     viewpoints = orbit.viewpoints(args.orbit, width, height, fov)
+    if args.panorama:
+        viewpoints = [panorama(view, orbit.up) for view in viewpoints]
     images = render_cameras(model, viewpoints, folder, [ORBIT, ORBIT_GIF])
     write_animation(folder.path / ORBIT, images)
 
@@ -326,16 +346,24 @@ def render_cameras(
         yield image
 
 
+def _default_size(args: argparse.Namespace) -> tuple[int, int]:
+    return PANORAMA_SIZE if args.panorama else DEFAULT_SIZE
+
+
 def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
     """Return the cameras of ``--camera`` or of ``--origin``, relative to the model's origin."""
     size: tuple[int, int] | None = tuple(args.size) if args.size else None
     origin = model.gaussians.origin
     if args.camera is not None:
         samples = model.config.data.shutter_samples if model.config else SHUTTER_SAMPLES
-        views = read_viewpoints(args.camera, size, samples)
+        of_file = PANORAMA_SIZE if args.panorama else None
+        views = read_viewpoints(args.camera, size or of_file, samples)
     else:
         pose = look_at(args.origin, args.target or origin, args.up or UP)
-        views = [pinhole("camera", pose, *(size or DEFAULT_SIZE), args.fov or FIELD_OF_VIEW)]
+        views = [pinhole("camera", pose, *(size or _default_size(args)), args.fov or FIELD_OF_VIEW)]
+    if args.panorama:
+        up = None if args.camera is not None else np.array(args.up or UP)
+        views = [panorama(view, up) for view in views]
     return [view.with_offset(-np.array(origin)) for view in views]
 
 
@@ -415,7 +443,7 @@ def _check(args: argparse.Namespace) -> None:
     if what.suffix.lower() == ".xml":
         _check_options(args, {"define"}, "a Mitsuba scene, which has its own cameras and settings")
         variants = mi.variants()
-    elif format_for(what) is not None or what.is_dir():
+    elif format_to_read(what) is not None or what.is_dir():
         _check_cameras(args)
         variants = VARIANTS
     else:
@@ -437,6 +465,8 @@ def _check_cameras(args: argparse.Namespace) -> None:
             f"{args.what}: choose the cameras: --orbit N, --camera FILE.json, --origin X Y Z, or "
             "--split with --scene CONFIG.yml"
         )
+    if args.panorama and args.fov is not None:
+        raise UserError(f"--fov: a panorama shows all directions, got {args.fov:g}; leave it out")
     way = way or "split"
     used, place = {way, *CAMERA_OPTIONS[way], *MODEL_OPTIONS}, f"Gaussians and --{way}"
     if not has_photographs:

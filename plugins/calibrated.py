@@ -36,6 +36,8 @@ from drgs.integrator.sensors import (
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 """Coefficients of the shipped lenses; other lenses have others."""
 
+INTRINSICS = ("fx", "fy", "cx", "cy")
+
 PROPERTIES = {
     "fx": positive(1.0),
     "cx": number(0.0),
@@ -76,9 +78,10 @@ class CalibratedSensor(mi.Sensor):
      * - lens
        - |string|
        - ``pinhole``; ``opencv``: radial and tangential distortion; ``fisheye``: by the angle from
-         the axis (Kannala and Brandt 2006); ``thin_prism_fisheye``: COLMAP's THIN_PRISM_FISHEYE; or
-         a lens that another package registers, whose coefficients are parameters as well. (Default:
-         ``pinhole``)
+         the axis (Kannala and Brandt 2006); ``thin_prism_fisheye``: COLMAP's THIN_PRISM_FISHEYE;
+         ``equirectangular``: the whole film is a panorama, without ``fx``, ``fy``, ``cx`` and
+         ``cy``; or a lens that another package registers, whose coefficients are parameters as
+         well. (Default: ``pinhole``)
      * - k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1
        - |float|
        - Coefficients of the lens as OpenCV and COLMAP define them. ``opencv`` has ``k1`` to ``k6``,
@@ -124,6 +127,12 @@ class CalibratedSensor(mi.Sensor):
         values |= read(props, {"fy": positive(values["fx"])})
         self.fx, self.fy, self.cx, self.cy = (mi.Float(values[k]) for k in ("fx", "fy", "cx", "cy"))
         self.lens = _lens(props)
+        self.intrinsics = () if self.lens.whole_turn else INTRINSICS
+        if unused := [name for name in INTRINSICS if name in props and not self.intrinsics]:
+            raise PluginError(
+                f"calibrated: the film of lens '{self.lens.kind}' is a whole turn, whatever "
+                f"{' and '.join(unused)}; leave them out"
+            )
         self.coefficients = {k: mi.Float(v) for k, v in self.lens.coefficients().items()}
         self.near, self.far = values["near_clip"], values["far_clip"]
         if self.near >= self.far:
@@ -141,7 +150,7 @@ class CalibratedSensor(mi.Sensor):
     def traverse(self, cb: mi.TraversalCallback) -> None:
         super().traverse(cb)
         cb.put("to_world", self.m_to_world, mi.ParamFlags.Differentiable)
-        intrinsics = {name: getattr(self, name) for name in ("fx", "fy", "cx", "cy")}
+        intrinsics = {name: getattr(self, name) for name in self.intrinsics}
         for name, value in (intrinsics | self.coefficients).items():
             cb.put(name, value, mi.ParamFlags.Differentiable)
         if self.to_world_close is not None:
@@ -173,7 +182,7 @@ class CalibratedSensor(mi.Sensor):
     def camera_parameters(self) -> list[str]:
         """Return the names of differentiable parameters."""
         moves = ["to_world_close"] if self.to_world_close is not None else []
-        return ["to_world", *moves, "fx", "fy", "cx", "cy", *self.coefficients]
+        return ["to_world", *moves, *self.intrinsics, *self.coefficients]
 
     def camera_from_state(self, state: SensorState) -> Camera:
         """Return the camera with the sensor's lens."""
@@ -187,8 +196,9 @@ class CalibratedSensor(mi.Sensor):
 
     def _pinhole(self, state: SensorState) -> Camera:
         device = state.device
-        focal, principal = (device["fx"], device["fy"]), (device["cx"], device["cy"])
-        camera = on_crop_window(state, opaque_host(state), device["to_world"], focal, principal)
+        host = opaque_host(state)
+        fx, fy, cx, cy = (device.get(name, type(host[0])(1)) for name in INTRINSICS)
+        camera = on_crop_window(state, host, device["to_world"], (fx, fy), (cx, cy))
         if self.to_world_close is None:
             return camera
         from drgs.cameras.motion import Motion, MotionBlur, RollingShutter

@@ -2,7 +2,8 @@
 
     python scenes/gallery.py
 
-Writes ``depth.jpg``, ``normals.jpg``, ``fisheye.jpg``, ``defocus.jpg`` and ``popping.jpg``.
+Writes ``depth.jpg``, ``normals.jpg``, ``fisheye.jpg``, ``panorama.jpg``, ``defocus.jpg`` and
+``popping.jpg``.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def main() -> None:
     out = parser.parse_args().out
     mi.set_variant("llvm_ad_rgb")
     out.mkdir(parents=True, exist_ok=True)
-    for render in (depth, normals, fisheye, defocus, popping):
+    for render in (depth, normals, fisheye, panorama, defocus, popping):
         image = np.clip(render(), 0, 1)
         iio.imwrite(out / f"{render.__name__}.jpg", np.uint8(255 * image + 0.5), quality=88)
 
@@ -52,11 +53,12 @@ def render(sensor: dict[str, Any] | None = None, **settings: object) -> np.ndarr
 
 def camera(origin: tuple[float, float, float] = (2.6, -2.4, 1.5), **others: Any) -> dict[str, Any]:
     """Return a sensor that looks at the truck."""
-    film = {"type": "hdrfilm", "width": SIZE_PX, "height": SIZE_PX, "rfilter": {"type": "box"}}
-    samples = others.pop("samples", 1)
+    width, height = others.pop("size", (SIZE_PX, SIZE_PX))
+    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
+    samples, target = others.pop("samples", 1), others.pop("target", [0, 0, 0])
     others = others or {"type": "perspective", "fov": 38}
     return others | {
-        "to_world": mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 0, 1]),
+        "to_world": mi.ScalarTransform4f().look_at(origin, target, [0, 0, 1]),
         "film": film,
         "sampler": {"type": "stratified", "sample_count": samples, "jitter": samples > 1},
     }
@@ -83,6 +85,17 @@ def fisheye() -> np.ndarray:
     """Return the image of a fisheye lens near the truck."""
     lens = {"type": "calibrated", "lens": "fisheye", "k1": 0.02, "fx": 190.0, "fy": 190.0}
     return render({"origin": (0.9, -1.0, 0.55), **lens}, projection="unscented")[..., :3]
+
+
+def panorama() -> np.ndarray:
+    """Return all that is around a point on the truck."""
+    sensor = {
+        "type": "calibrated",
+        "lens": "equirectangular",
+        "near_clip": 0.2,
+        "size": (1000, 500),
+    }
+    return render({"origin": (0.0, -0.2, 0.2), "target": (0.0, 1.0, 0.2), **sensor})[..., :3]
 
 
 def defocus() -> np.ndarray:

@@ -151,9 +151,10 @@ def mitsuba_scene(case, sensors=1) -> mi.Scene:
         "component_format": "float32", "rfilter": {"type": "box"},
     }  # fmt: skip
     K = case.K
+    intrinsics = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     sensor = {
         "type": "calibrated", "lens": case.lens.kind, **coefficients, "near_clip": 0.25,
-        "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "film": film,
+        **({} if case.lens.whole_turn else intrinsics), "film": film,
         "to_world": mi.ScalarTransform4f(to_world),
         "sampler": {"type": "independent", "sample_count": 1},
     }  # fmt: skip

@@ -95,6 +95,8 @@ def _type(field: dict[str, Any], models: dict[str, Any]) -> str:
         return ", or ".join([*kinds, last])
     if "enum" in field:
         return ", ".join(map(str, field["enum"]))
+    if "items" in field and "$ref" not in field["items"]:
+        return f"list of {field['items']['type']}"
     if "items" in field:
         return f"list of {{{', '.join(_model(field['items'], models)['properties'])}}}"
     name = field.get("format", field.get("type", ""))

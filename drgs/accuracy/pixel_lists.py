@@ -255,6 +255,7 @@ def _items(
     def body(masks: UInt32, item: UInt32) -> tuple:
         micro = dr.tzcnt(masks)
         middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
+        middle = bins.model.nearest(middle[0], geometry[0]), middle[1]
         a, denominator = depths.depth_ratio(bins.model.falloff, geometry, keys, *middle)
         # Without a peak here, a neighbouring pixel may have one.
         along = dr.select(a > 0, a / denominator, 1)

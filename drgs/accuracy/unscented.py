@@ -90,9 +90,8 @@ def _sigma_points(
         for c in (SIGMA_POINT_STDS, -SIGMA_POINT_STDS):
             seen, point, _ = lens.visibility(not_nearer, position + c * (camera.rotation @ axis))
             usable &= seen
-            for side, offset in zip(
-                offsets, lens.project_point(camera, point) - center, strict=True
-            ):
+            place = lens.project_point(camera, point)
+            for side, offset in zip(offsets, lens.offset(camera, center, place), strict=True):
                 side.append(offset)
     return _SigmaPoints(offsets, [SIGMA_POINT_WEIGHT * sum(o[1:], o[0]) for o in offsets], usable)
 

@@ -132,7 +132,8 @@ class Camera(CameraParameters):
             return origin, direction, True
         seen, _, _ = self.lens.visibility(replace(self, near=type(self.near)(0)), direction)
         t = types_of(type(self.near))
-        missed = self.lens.project_point(self, direction) - t.Array2f(x, y)
+        place = self.lens.project_point(self, direction)
+        missed = self.lens.offset(self, t.Array2f(x, y), place)
         return origin, direction, seen & (dr.squared_norm(missed) < MAX_RAY_ERROR_PX**2)
 
     def view_directions(self, x: Float, y: Float, count: int) -> tuple[Array3f, Bool | bool, int]:

@@ -32,6 +32,7 @@ LENSES: ClassRegistry[Lens] = ClassRegistry(
         "opencv": "drgs.cameras.radial_tangential",
         "fisheye": "drgs.cameras.fisheye",
         "thin_prism_fisheye": "drgs.cameras.thin_prism_fisheye",
+        "equirectangular": "drgs.cameras.equirectangular",
     },
 )
 """Lenses by name."""
@@ -69,6 +70,9 @@ class Lens:
     kind: ClassVar[str] = ""  # name in LENSES
     distorts: ClassVar[bool] = True  # whether a pinhole could take its place
     parallel: ClassVar[bool] = False  # whether its rays are, instead of meeting in the camera
+    whole_turn: ClassVar[bool] = False
+    """Whether the whole film is a turn about the vertical axis. Its left side then continues at the
+    right one, and the camera's focal lengths and principal point are not used."""
     groups: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Names of coefficients by field, a tuple of the first of them; none: a field is a coefficient.
     """
@@ -155,6 +159,11 @@ class Lens:
         given = {f: names[: len(getattr(self, f))] for f, names in self.groups.items()}
         return replace(self, **{f: tuple(values[n] for n in names) for f, names in given.items()})
 
+    def describe(self) -> str:
+        """Return the lens's name and the names of its coefficients."""
+        names = ", ".join(self.coefficients())
+        return f"{self.kind} ({names})" if names else self.kind
+
     def upload(self, float_type: type) -> Lens:
         """Return the lens with Dr.Jit scalars for its numbers: kernels are the same for all."""
 
@@ -222,6 +231,19 @@ class Lens:
     ) -> Array2f:
         """Return the place on the film of a ray (camera axes), px."""
         return self.project_point(camera, direction)
+
+    def focal_lengths(self, camera: CameraParameters) -> Array2f:
+        """Return px per radian on the axis."""
+        return camera.focal
+
+    def period(self, camera: CameraParameters) -> Float | None:
+        """Return after how many px along x the film shows the same again; None: it does not."""
+        return camera.film_end.x - camera.film_start.x if self.whole_turn else None
+
+    def offset(self, camera: CameraParameters, start: Array2f, end: Array2f) -> Array2f:
+        """Return the shortest way from one place of the film to another, px."""
+        x, y = end - start
+        return type(start)(shortest(x, self.period(camera)), y)
 
 
 class Perspective(Lens):
@@ -294,6 +316,11 @@ class Pinhole(Perspective):
 
 
 PINHOLE = Pinhole()
+
+
+def shortest(dx: Float, period: Float | None) -> Float:
+    """Return an offset along x, px, across the sides of the film where that is shorter."""
+    return dx if period is None else dr.fma(-period, dr.round(dx / period), dx)
 
 
 def slopes_of(position: Array3f) -> list[Float]:

@@ -59,6 +59,17 @@ class CommandParser(argparse.ArgumentParser):
         """End the help with command lines; ``%(prog)s`` in them is the command."""
         self.epilog = "\n  ".join(["example:" if len(lines) == 1 else "examples:", *lines])
 
+    def add_overrides(self, text: str) -> None:
+        """Add ``--set``, which gives values of a configuration; text: its help."""
+        self.add_argument(
+            "--set",
+            dest="overrides",
+            action="append",
+            default=[],
+            metavar="KEY=VALUE",
+            help=f"{text}; repeatable",
+        )
+
     def add_commands(self, commands: dict[str, Subcommand], metavar: str) -> None:
         """Add subcommands by name, exactly one of which has to be given."""
         self._subcommands = tuple(commands)

@@ -197,6 +197,11 @@ class DensifyConfig(Section):
     max_gaussians: int = Field(
         1_000_000, ge=4, le=100_000_000, description="Limit that the population never exceeds."
     )
+    remove_floaters: bool = Field(
+        True,
+        description="Remove Gaussians close before a few cameras, after 50, 70 and 90 % of the "
+        "iterations.",
+    )
     adc: AdcConfig = subsection(AdcConfig)
     budget: BudgetConfig = subsection(BudgetConfig)
     mcmc: McmcConfig = subsection(McmcConfig)

@@ -24,6 +24,7 @@ STRATEGIES: Registry[type] = Registry(
         "mcmc": "drgs.training.density.mcmc",
         "importance": "drgs.training.density.pruning",
         "selection": "drgs.training.density.pruning",
+        "floaters": "drgs.training.density.floaters",
     },
 )
 """Subclasses of :class:`drgs.training.density.strategy.DensityStrategy`."""
@@ -35,6 +36,7 @@ EFFECTS: Registry[type] = Registry(
         # the one that is rendered, with derivatives.
         "depth": "drgs.training.effects.depth",
         "colors": "drgs.training.effects.colors",
+        "photometry": "drgs.training.effects.photometry",
         "background": "drgs.training.effects.background",
         "masks": "drgs.training.effects.masks",
         "smoothing": "drgs.training.effects.smoothing",

@@ -98,6 +98,11 @@ class DataConfig(Section):
         description="nerfstudio, colmap: images 0, n, 2n, ... by file name are the test split, "
         "unless the data lists splits.",
     )
+    leave_out: list[str] = Field(
+        default_factory=list,
+        description="Photographs that are not used, by file name, with or without suffix and "
+        "folders: 0012, 0012.jpg, images/0012.jpg.",
+    )
     background: ColorField = Field(
         None,
         description="white, black or [r, g, b] in display space: background of transparent images, "
@@ -122,6 +127,17 @@ class DataConfig(Section):
         False, description="Do not read depth, as with a loss.depth_weight of 0."
     )
     ignore_points: bool = Field(False, description="Do not use the dataset's own point cloud.")
+    in_memory: bool | None = Field(
+        None,
+        description="Keep photographs in memory. false: on disk, from where another thread reads "
+        "them ahead; the fit has the same bytes. null: false if they take more than half of the "
+        "available memory.",
+    )
+    depth_from: PathField | None = Field(
+        None,
+        description="PLY file of a mesh of triangles, or of points, in the cameras' world: depth "
+        "of the training views, instead of the data's.",
+    )
 
     @property
     def background_rgb(self) -> tuple[float, float, float]:
@@ -352,7 +368,7 @@ class LossConfig(Section):
 
 
 class ColorConfig(Section):
-    """A colour transform for each training photograph: exposure and white balance."""
+    """Exposure and white balance of each training photograph, and each camera's vignetting."""
 
     lr: Rate | None = Field(
         None,
@@ -362,6 +378,18 @@ class ColorConfig(Section):
     )
     identity_weight: Weight = Field(
         1.0, description="Weight of the mean squared difference from the identity."
+    )
+    vignetting_lr: Rate | None = Field(
+        None,
+        gt=0,
+        description="Initial rate of the three coefficients of each camera's vignetting, such as "
+        "0.03. null: no vignetting.",
+    )
+    response_lr: Rate | None = Field(
+        None,
+        gt=0,
+        description="Initial rate of the two numbers by which each camera's response differs from "
+        "the mean of all, such as 0.005. null: the same response.",
     )
 
 
@@ -501,6 +529,10 @@ class FitConfig(Section):
     @model_validator(mode="after")
     def _check_relations(self) -> FitConfig:
         init, densify, optimizer = self.init, self.densify, self.optimizer
+        if self.data_for_training.ignore_depth:
+            expected = "data.depth_from must be null without loss.depth_weight, or with "
+            depth_from = self.data.depth_from
+            _require(depth_from is None, expected + "data.ignore_depth", depth_from)
         if init.start in ("masks", "random"):
             expected = f"init.point_cloud must be null where init.start is {init.start}"
             _require(init.point_cloud is None, expected, init.point_cloud)

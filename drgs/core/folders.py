@@ -75,7 +75,9 @@ class FolderRecord:
         """
         names = list(names)
         self.check(names, earlier)
-        remove_temporaries_of(self.folder, [*names, self.path.name])
+        for folder in {self.folder / Path(name).parent for name in names} | {self.folder}:
+            here = [Path(name).name for name in names if self.folder / Path(name).parent == folder]
+            remove_temporaries_of(folder, [*here, self.path.name])
         known = self._content.files if self.exists else dict.fromkeys(earlier)
         claimed = {**known, **dict.fromkeys(names)}
         self._write(_Content(files=claimed, paths={**self.paths, **(paths or {})}))
@@ -98,6 +100,9 @@ class FolderRecord:
 
     def _is_foreign(self, name: str) -> bool:
         path = self.folder / name
+        for parent in (self.folder / part for part in Path(name).parents[:-1]):
+            if os.path.lexists(parent) and not parent.is_dir():
+                return True
         if not os.path.lexists(path):
             return False
         if name not in self._content.files or path.is_symlink() or not path.is_file():

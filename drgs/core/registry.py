@@ -191,8 +191,10 @@ def temporary_registrations() -> Iterator[None]:
     finally:
         _loaded.intersection_update(loaded)
         for registry, extensions in before:
-            registry._extensions.clear()
-            registry._extensions.update(extensions)
+            # Modules of drgs are not imported again.
+            now = registry._extensions
+            shipped = {name: now[name] for name in registry._shipped.keys() & now.keys()}
+            registry._extensions = {**shipped, **extensions}
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
 from drgs.core.origin import WORLD, choose_origin, format_origin
+from drgs.datasets.splits import leave_out
 from drgs.datasets.types import Dataset, View, ViewFilter, Viewpoint, all_views
 
 __all__ = ["Dataset", "View", "Viewpoint", "load_dataset"]
@@ -44,12 +45,16 @@ def load_dataset(
         source = config_from({"data": {**given, **settings}}, "load_dataset()").data
     from drgs.datasets.folders import find_reader  # a list of commands needs no readers
 
-    dataset = find_reader(source, sections)[1].load(source, keeps)
+    dataset = leave_out(find_reader(source, sections)[1].load(source, keeps), source)
     if not dataset.train:
         return dataset
     middle = np.mean([view.center for view in dataset.train], axis=0)
     origin = choose_origin(middle, dataset.extent)
-    if origin == WORLD:
-        return dataset
-    note = f"; far from the origin: coordinates are relative to {format_origin(origin)}"
-    return replace(dataset.relative_to(origin), description=dataset.description + note)
+    if origin != WORLD:
+        note = f"; far from the origin: coordinates are relative to {format_origin(origin)}"
+        dataset = replace(dataset.relative_to(origin), description=dataset.description + note)
+    if source.depth_from is not None and not source.ignore_depth:
+        from drgs.datasets.surface_depths import with_depths_from
+
+        dataset = with_depths_from(source.depth_from, dataset, keeps)
+    return dataset

@@ -168,23 +168,38 @@ def _values(
             "(colmap image_undistorter), or have COLMAP find another model"
         )
     width, height = _size_as_calibrated(file, camera, image, folder)
-    named = dict(camera.values)
-    scale_x, scale_y = width / camera.width, height / camera.height
-    focal = named.pop("f", None)
     return FrameValues.model_construct(
         None,
         file_path=image.name,
         transform_matrix=image.camera_to_world,
         mask_path=None if mask is None else str(mask),
-        fl_x=scale_x * (named.pop("fx") if focal is None else focal),
-        fl_y=scale_y * (named.pop("fy") if focal is None else focal),
-        cx=scale_x * named.pop("cx"),
-        cy=scale_y * named.pop("cy"),
         w=width,
         h=height,
         camera_model=camera.model,
-        **named,
+        **_intrinsics(camera, width, height, folder),
     )
+
+
+def _intrinsics(camera: ColmapCamera, width: int, height: int, folder: Path) -> dict[str, float]:
+    """Return a frame's numbers for photographs of this size, and the lens's coefficients."""
+    named = dict(camera.values)
+    if camera.model == "EQUIRECTANGULAR":
+        if (size := (named["w"], named["h"])) != (camera.width, camera.height):
+            raise UserError(
+                f"{folder}: camera {camera.number}: w and h of a panorama must be its size, "
+                f"{camera.width} x {camera.height} px, got {size[0]:g} x {size[1]:g}; "
+                "give whole panoramas"
+            )
+        return {}
+    scale_x, scale_y = width / camera.width, height / camera.height
+    focal = named.pop("f", None)
+    return {
+        "fl_x": scale_x * (named.pop("fx") if focal is None else focal),
+        "fl_y": scale_y * (named.pop("fy") if focal is None else focal),
+        "cx": scale_x * named.pop("cx"),
+        "cy": scale_y * named.pop("cy"),
+        **named,
+    }
 
 
 def _size_as_calibrated(

@@ -1,20 +1,24 @@
 """Images of views: read, composited over a background, scaled, and kept in little memory.
 
 The file's integers are kept, and floats, which take four times the memory, computed at each access.
+What would not fit into memory is read from disk: see :mod:`drgs.datasets.storage`.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy import sparse
 
-from drgs.core.errors import UserError, one_line
+from drgs.core.errors import UserError, UserNote, one_line
 from drgs.core.files import open_regular
 from drgs.core.memory import available_memory, format_bytes, require_memory
+from drgs.datasets.storage import MEMORY, Decode, DiskStore, MemoryStore, is_on_disk
 from drgs.datasets.types import LazyImage, Pixels, View
 from drgs.io.images import (
     BITS,
@@ -29,6 +33,8 @@ from drgs.io.images import (
 MAX_PIXELS_AT_ONCE = 1 << 25  # of photographs that are read at a time: 40 bytes each, at most
 
 MAX_THREADS = 8
+
+MAX_MEMORY_SHARE = 0.5  # of the available memory, for photographs: Gaussians need about as much
 
 MIN_WHOLE_SHARE = 1 - 1e-4  # share of a pixel's area that counts as all of it, up to rounding
 
@@ -179,12 +185,12 @@ def _average_rows(image: np.ndarray, count: int) -> np.ndarray:
         for i in range(1, factor):
             total = total + image[i::factor]
         return total / np.float32(factor)
-    edges = np.arange(count + 1) * (length / count)
-    pixel = np.arange(length)
-    upper = np.minimum(edges[1:, None], pixel[None, :] + 1)
-    lower = np.maximum(edges[:-1, None], pixel[None, :])
-    weights = np.maximum(upper - lower, 0) * (count / length)
-    return np.tensordot(weights.astype(np.float32), image, axes=1)
+    edges = np.union1d(np.arange(length + 1), np.arange(1, count) * (length / count))
+    middles = (edges[1:] + edges[:-1]) / 2  # of parts that are in one old and in one new pixel
+    place = (middles * count / length).astype(np.int64), middles.astype(np.int64)
+    shares = np.diff(edges) * (count / length)
+    weights = sparse.csr_array((shares.astype(np.float32), place), (count, length))
+    return (weights @ image.reshape(length, -1)).reshape(count, *image.shape[1:])
 
 
 def smaller_view(view: View, factor: int) -> View:
@@ -199,7 +205,8 @@ def smaller_view(view: View, factor: int) -> View:
         if image is None:
             return None
         shape = (height, width, *image.shape[2:])
-        return LazyImage(shape, lambda: scale(np.asarray(image), new_width), 0)
+        on_disk = isinstance(image, LazyImage) and image.is_on_disk
+        return LazyImage(shape, lambda: scale(np.asarray(image), new_width), 0, None, on_disk)
 
     return replace(
         view,
@@ -216,6 +223,13 @@ def smaller_view(view: View, factor: int) -> View:
     )
 
 
+def with_arrays(view: View) -> View:
+    """Return the view with arrays for its lazy images, which are then computed once."""
+    images = {name: getattr(view, name) for name in ("image", "alpha", "mask", "depth")}
+    arrays = {name: np.asarray(each) for name, each in images.items() if each is not None}
+    return replace(view, **arrays)
+
+
 def shift_pixels(view: View) -> tuple[View, ...]:
     """Return the view, and if its images can be shifted three more, whose pixels are elsewhere.
 
@@ -227,10 +241,10 @@ def shift_pixels(view: View) -> tuple[View, ...]:
     shifted = {n: p.shifted for n, p in planes.items() if isinstance(p, LazyImage) and p.shifted}
     if len(shifted) < len(planes) or view.mask is not None or view.depth is not None:
         return (view,)
-    views = [view]
+    views, on_disk = [view], is_on_disk(view)
     for x, y in ((1, 0), (0, 1), (1, 1)):
         images = {
-            name: LazyImage(planes[name].shape, partial(compute, x, y), 0)
+            name: LazyImage(planes[name].shape, partial(compute, x, y), 0, None, on_disk)
             for name, compute in shifted.items()
         }
         views.append(replace(view, cx=view.cx - x / 2, cy=view.cy - y / 2, **images))
@@ -241,35 +255,47 @@ def shift_pixels(view: View) -> tuple[View, ...]:
 
 
 def compact_photograph(
-    pixels: np.ndarray, background: tuple[float, float, float], max_width: int | None
+    pixels: np.ndarray,
+    background: tuple[float, float, float],
+    max_width: int | None,
+    store: MemoryStore = MEMORY,
+    source: tuple[Path, Decode] | None = None,
 ) -> tuple[Pixels, Pixels | None]:
     """Return ``image`` and ``alpha`` of a :class:`View` in a form that takes little memory.
 
     That is the file's pixels, or floats where they take less; numbers of 16 bits where scaling is
     by no whole factor, which takes long. Pixels with alpha that are halved can be shifted; those of
     photographs, which a lens has blurred, were measured to gain nothing. pixels: of
-    :func:`drgs.io.images.read_pixels`.
+    :func:`drgs.io.images.read_pixels`; source: their file, and what decodes it again.
     """
     height, width, channels = pixels.shape
     new_width, new_height = downscaled_size(width, height, max_width)
 
-    def image(x: int = 0, y: int = 0) -> np.ndarray:
-        return downscale(composite(as_numbers(_shift(pixels, x, y)), background), max_width)
+    def image(pixels: Pixels, x: int = 0, y: int = 0) -> np.ndarray:
+        shifted = as_numbers(_shift(np.asarray(pixels), x, y))
+        return downscale(composite(shifted, background), max_width)
 
-    def alpha(x: int = 0, y: int = 0) -> np.ndarray:
-        return downscale(as_numbers(_shift(pixels, x, y)[:, :, 3]), max_width)
+    def alpha(pixels: Pixels, x: int = 0, y: int = 0) -> np.ndarray:
+        return downscale(as_numbers(_shift(np.asarray(pixels), x, y)[:, :, 3]), max_width)
 
     if 4 * new_width * new_height * channels < pixels.nbytes:
-        return image(), alpha() if channels == 4 else None
+        return store.keep(image(pixels)), store.keep(alpha(pixels)) if channels == 4 else None
     if width % new_width or height % new_height:
-        return _quantize(image()), _quantize(alpha()) if channels == 4 else None
-    shape = (new_height, new_width)
+        quantized_alpha = _quantize(alpha(pixels), store) if channels == 4 else None
+        return _quantize(image(pixels), store), quantized_alpha
+    if source is not None and new_width == width and channels == 3:
+        kept = store.keep_file(source[0], pixels, source[1])
+    else:  # decoding takes long beside an iteration, or is needed for the image and for alpha
+        kept = store.keep(pixels)
+    shape, on_disk = (new_height, new_width), store.is_on_disk
     if channels == 3:
-        return LazyImage((*shape, 3), image, pixels.nbytes), None
-    shifted = (image, alpha) if can_shift(pixels, (new_width, new_height)) else (None, None)
+        return LazyImage((*shape, 3), partial(image, kept), kept.nbytes, None, on_disk), None
+    shifted = None, None
+    if can_shift(pixels, (new_width, new_height)):
+        shifted = partial(image, kept), partial(alpha, kept)
     return (
-        LazyImage((*shape, 3), image, pixels.nbytes, shifted[0]),
-        LazyImage(shape, alpha, 0, shifted[1]),
+        LazyImage((*shape, 3), partial(image, kept), kept.nbytes, shifted[0], on_disk),
+        LazyImage(shape, partial(alpha, kept), 0, shifted[1], on_disk),
     )
 
 
@@ -286,21 +312,37 @@ def _shift(pixels: np.ndarray, x: int, y: int) -> np.ndarray:
     return np.pad(pixels[y:, x:], ((0, y), (0, x), (0, 0)), "edge") if x or y else pixels
 
 
-def _quantize(numbers: np.ndarray) -> LazyImage:
+def _quantize(numbers: np.ndarray, store: MemoryStore) -> LazyImage:
     """Return numbers in 0..1 that are kept in 16 bits each."""
-    kept = np.round(numbers * np.float32(MAX_16_BITS)).astype(np.uint16)
-    return LazyImage(kept.shape, lambda: as_numbers(kept), kept.nbytes)
+    kept = store.keep(np.round(numbers * np.float32(MAX_16_BITS)).astype(np.uint16))
+    return _convert_lazily(kept, as_numbers, store)
 
 
-def compact_mask(mask: np.ndarray) -> LazyImage:
+def compact_mask(mask: np.ndarray, store: MemoryStore = MEMORY) -> LazyImage:
     """Return a mask (H, W) of 1 and 0 that is kept in a byte each."""
-    kept = mask.astype(np.uint8)
-    return LazyImage(mask.shape, lambda: kept.astype(np.float32), kept.nbytes)
+    kept = store.keep(mask.astype(np.uint8))
+    return _convert_lazily(kept, lambda kept: kept.astype(np.float32), store)
 
 
-def check_memory(files: Sequence[Path], max_width: int | None) -> None:
-    """Raise :class:`UserError` if the stored photographs do not fit into memory."""
-    needed = 0
+def _convert_lazily(
+    kept: Pixels, convert: Callable[[np.ndarray], np.ndarray], store: MemoryStore
+) -> LazyImage:
+    """Return an image that is converted at each access."""
+    return LazyImage(
+        kept.shape, lambda: convert(np.asarray(kept)), kept.nbytes, None, store.is_on_disk
+    )
+
+
+def choose_store(
+    files: Sequence[Path], max_width: int | None, in_memory: bool | None
+) -> MemoryStore:
+    """Return the store for photographs: memory, or a disk where they do not fit.
+
+    in_memory: None: if they take less than half of what is available.
+
+    Raises :class:`UserError` if the stored photographs do not fit into memory, or on the disk.
+    """
+    needed, written = 0, 0  # bytes in memory; on disk
     for file in files:
         header = read_header(file)
         (width, height), channels = header.size, 4 if header.has_alpha else 3
@@ -308,13 +350,32 @@ def check_memory(files: Sequence[Path], max_width: int | None) -> None:
         new_size = channels * new_width * new_height
         size = channels * width * height * BITS.get(header.mode, 8) // 8
         is_fractional = width % new_width or height % new_height
-        needed += min(4 * new_size, 2 * new_size if is_fractional else size)
-    if needed > (available := available_memory()):
+        kept = min(4 * new_size, 2 * new_size if is_fractional else size)
+        needed += kept
+        written += kept if new_width < width or channels == 4 else 0
+    available = available_memory()
+    if in_memory is False:
+        return DiskStore(written, len(files))
+    if in_memory is None and needed > MAX_MEMORY_SHARE * available:
+        try:
+            store = DiskStore(written, len(files))
+        except UserError:
+            if needed > available:
+                raise
+        else:
+            note = (
+                f"{files[0].parent}: {len(files):,} photographs take {format_bytes(needed)}, and "
+                f"{format_bytes(available)} of memory are available: they are read from disk"
+            )
+            warnings.warn(UserNote(note), stacklevel=2)
+            return store
+    if needed > available:
         raise UserError(
             f"{files[0].parent}: {len(files):,} photographs take {format_bytes(needed)} of memory "
-            f"as they are kept, and {format_bytes(available)} are available; set a smaller "
-            "data.image_size, or use fewer of them"
+            f"as they are kept, and {format_bytes(available)} are available; set "
+            "data.in_memory=false or a smaller data.image_size, or use fewer of them"
         )
+    return MEMORY
 
 
 def num_threads(files: Sequence[Path]) -> int:
@@ -341,7 +402,7 @@ def unread_image(shape: tuple[int, ...], name: object, is_shifted: bool = False)
     def refuse(*_: int) -> np.ndarray:
         raise RuntimeError(f"{name}: another process has its image")
 
-    return LazyImage(shape, refuse, 0, refuse if is_shifted else None)
+    return LazyImage(shape, refuse, 0, refuse if is_shifted else None, is_elsewhere=True)
 
 
 def without_images(view: View) -> View:

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drgs.config.schema import NEAR_LIMITS, REFERENCE_NEAR
 from drgs.core.errors import UserError
 from drgs.datasets.types import Viewpoint
-from drgs.datasets.viewpoints import focus_of, format_vector, look_at, pinhole
+from drgs.datasets.viewpoints import (
+    FIELD_OF_VIEW,
+    focus_of,
+    format_vector,
+    level_axes,
+    look_at,
+    pinhole,
+)
 from drgs.gaussians.parameters import Gaussians
 
 ELEVATION, MAX_ELEVATION = math.radians(30), math.radians(80)
 """Elevation of an orbit without cameras; and of any orbit, which would spin in place beyond."""
 
 MAX_ORBIT_SIDE_PX = 400
+
+ELEVATIONS = (-25, 5, 35, 65)  # degrees, of rings of cameras around Gaussians
 
 OPAQUE, SPREAD = 0.5, 0.98
 """Least opacity of Gaussians that decide where an orbit without cameras looks; and the share of
@@ -73,7 +82,7 @@ def orbit_of_views(views: Sequence[Viewpoint], gaussians: Gaussians) -> Orbit:
         focus = _middle(gaussians)[0]
         radius = float(np.median(np.linalg.norm(centers - focus, axis=1)))
     up = up_of(views)
-    start, side = _level_axes(up, (centers - focus).mean(axis=0))
+    start, side = level_axes(up, (centers - focus).mean(axis=0))
     offsets = centers - focus
     distances = np.maximum(np.linalg.norm(offsets, axis=1), np.finfo(np.float64).tiny)
     elevation = float(np.mean(np.arcsin(np.clip(offsets @ up / distances, -1, 1))))
@@ -100,17 +109,31 @@ def orbit_of_gaussians(gaussians: Gaussians, up: np.ndarray, fov: float) -> Orbi
         raise UserError(f"camera: up must not be zero or infinite, got {format_vector(up)}")
     focus, spread = _middle(gaussians)
     up = up / length
-    start, _ = _level_axes(up, np.array([0.0, -1.0, 0.0]))
+    start, _ = level_axes(up, np.array([0.0, -1.0, 0.0]))
     radius = spread / math.sin(math.radians(fov) / 2)
     return Orbit(focus, up, start, radius, ELEVATION, half_arc=None)
 
 
+def rings_around(
+    gaussians: Gaussians, up: np.ndarray, views_per_ring: int, side_px: int
+) -> list[Viewpoint]:
+    """Return square cameras on rings around the opaque Gaussians; up: (3,) unit, their axis."""
+    orbit = orbit_of_gaussians(gaussians, up, FIELD_OF_VIEW)
+    rings = [replace(orbit, elevation=math.radians(degrees)) for degrees in ELEVATIONS]
+    return [v for r in rings for v in r.viewpoints(views_per_ring, side_px, side_px, FIELD_OF_VIEW)]
+
+
 def near_plane_of(gaussians: Gaussians) -> float:
     """Return the near plane, scene units, for Gaussians without a configuration."""
-    size, (low, high) = _middle(gaussians, share=0.5)[1], NEAR_RANGE
+    size, (low, high) = extent_of(gaussians), NEAR_RANGE
     if low * size <= REFERENCE_NEAR <= high * size:
         return REFERENCE_NEAR
     return float(np.clip(NEAR_SHARE * size, *NEAR_LIMITS))
+
+
+def extent_of(gaussians: Gaussians) -> float:
+    """Return the median distance of the opaque Gaussians from their middle, scene units."""
+    return _middle(gaussians, share=0.5)[1]
 
 
 def up_of(views: Sequence[Viewpoint]) -> np.ndarray:
@@ -146,16 +169,6 @@ def _middle(gaussians: Gaussians, share: float = SPREAD) -> tuple[np.ndarray, fl
     middle = np.median(means, axis=0)
     distance = float(np.quantile(np.linalg.norm(means - middle, axis=1), share))
     return middle, distance or float(np.clip(g.scales.max(), np.finfo(np.float32).tiny, 1e9))
-
-
-def _level_axes(up: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two unit vectors that complete ``up``: the level part of ``towards``, and up x it."""
-    level = towards - (towards @ up) * up
-    if np.linalg.norm(level) <= 1e-6 * np.linalg.norm(towards):
-        level = np.eye(3)[np.argmin(np.abs(up))]
-        level = level - (level @ up) * up
-    level = level / np.linalg.norm(level)
-    return level, np.cross(up, level)
 
 
 def _covered_arc(azimuths: np.ndarray) -> tuple[float, float | None]:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from pydantic import BaseModel
@@ -22,7 +22,7 @@ from drgs.core.errors import UserError
 from drgs.datasets.images import (
     Pixels,
     can_shift,
-    check_memory,
+    choose_store,
     compact_mask,
     compact_photograph,
     downscale_depth,
@@ -37,6 +37,7 @@ from drgs.datasets.images import (
 )
 from drgs.datasets.notices import Notices
 from drgs.datasets.splits import Lists, split_of
+from drgs.datasets.storage import Decode, MemoryStore
 from drgs.datasets.transforms import (
     CLOSE_POSE_KEY,
     TransformsFrame,
@@ -44,11 +45,15 @@ from drgs.datasets.transforms import (
     focal_length,
     lens_of,
     motion_of,
+    panorama_intrinsics,
     principal_point,
     unique_names,
 )
 from drgs.datasets.types import Dataset, View, ViewFilter, all_views
 from drgs.io.images import read_header, read_pixels, upright
+
+if TYPE_CHECKING:
+    from drgs.cameras.lens import Lens
 
 __all__ = ["READERS", "DatasetReader", "Photographs", "TransformsFrame"]
 
@@ -147,30 +152,37 @@ def load_views(
 
     intrinsics: takes a frame, the shape of its photograph (H, W, C) and the size W, H of the view.
 
-    Raises :class:`UserError` for images that do not fit into memory or cannot be read.
+    Raises :class:`UserError` for images that do not fit into memory or on a disk, and for those
+    that cannot be read.
     """
     names = unique_names([frame.file_path for frame in frames])
     files = [frame.files["image"] for frame in frames]
     kept = [file for file, name in zip(files, names, strict=True) if keeps(name)]
-    check_memory(kept, config.image_size)
+    store = choose_store(kept, config.image_size, config.in_memory)
 
     def load(frame: TransformsFrame, name: str) -> View:
         file, is_read = frame.files["image"], keeps(name)
-        pixels = orient_as_calibrated((read_pixels if is_read else placeholder_pixels)(file), frame)
+
+        def decode() -> np.ndarray:
+            return orient_as_calibrated(read_pixels(file), frame)
+
+        pixels = decode() if is_read else orient_as_calibrated(placeholder_pixels(file), frame)
         if is_read:
             notices.inspect(file, pixels)
         height, width = pixels.shape[:2]
         size = downscaled_size(width, height, config.image_size)
         camera = intrinsics(frame, pixels.shape, size)  # first: raises for a wrong size
         image, alpha, mask, depth = (
-            _read_images(config, frame, pixels) if is_read else _unread_images(frame, pixels, size)
+            _read_images(config, frame, pixels, decode, store)
+            if is_read
+            else _unread_images(frame, pixels, size)
         )
         return View(
             name,
             frame.values.transform_matrix,
             *camera,
             *size,
-            lens=None if config.ignore_distortion else lens_of(frame),
+            lens=rendered_lens(config, frame),
             motion=None if config.ignore_motion else motion_of(frame, config.shutter_samples),
             image=image,
             alpha=alpha,
@@ -226,12 +238,20 @@ def _intrinsics(
                 f"{frame.location(key)} must be the image's size, {actual} px "
                 f"({frame.files['image']}), got {given:g}; scale the intrinsics or the images"
             )
+    if (lens := lens_of(frame)) is not None and lens.whole_turn:
+        return panorama_intrinsics(*size)
     fx = _focal(frame, "x", width)
     has_fy = values.fl_y is not None or values.camera_angle_y is not None
     fy = _focal(frame, "y", height) if has_fy else fx
     cx, cy = (_principal(frame, key, side) for key, side in (("cx", width), ("cy", height)))
     x, y = size[0] / width, size[1] / height
     return fx * x, fy * y, cx * x, cy * y
+
+
+def rendered_lens(config: DataConfig, frame: TransformsFrame) -> Lens | None:
+    """Return the frame's lens; None for a pinhole, and for one whose distortion is ignored."""
+    lens = lens_of(frame)
+    return None if lens is not None and lens.distorts and config.ignore_distortion else lens
 
 
 def _focal(frame: TransformsFrame, axis: str, side: int) -> float:
@@ -253,13 +273,22 @@ def _principal(frame: TransformsFrame, key: str, side: int) -> float:
 # Images, masks and depths of a frame
 
 
-def _read_images(config: DataConfig, frame: TransformsFrame, pixels: np.ndarray) -> Images:
-    image, alpha = compact_photograph(pixels, config.background_rgb, config.image_size)
+def _read_images(
+    config: DataConfig,
+    frame: TransformsFrame,
+    pixels: np.ndarray,
+    decode: Decode,
+    store: MemoryStore,
+) -> Images:
     files, stored, depth = frame.files, (pixels.shape[1], pixels.shape[0]), None
-    mask = _mask(config, files["mask"], stored) if "mask" in files else None
+    source = files["image"], decode
+    image, alpha = compact_photograph(
+        pixels, config.background_rgb, config.image_size, store, source
+    )
+    mask = _mask(config, files["mask"], stored, store) if "mask" in files else None
     if "depth" in files:
         depth = read_depth(files["depth"], _depth_unit(frame), stored)
-        depth = downscale_depth(depth, config.image_size)
+        depth = store.keep(downscale_depth(depth, config.image_size))
     return image, alpha, mask, depth
 
 
@@ -273,7 +302,7 @@ def _unread_images(frame: TransformsFrame, pixels: np.ndarray, size: tuple[int, 
     return image, alpha, mask, depth
 
 
-def _mask(config: DataConfig, file: Path, size: tuple[int, int]) -> Pixels:
+def _mask(config: DataConfig, file: Path, size: tuple[int, int], store: MemoryStore) -> Pixels:
     mask = downscale_mask(read_mask(file, size), config.image_size)
     if not mask.any():  # its PSNR is the mean of nothing
         raise UserError(
@@ -281,7 +310,7 @@ def _mask(config: DataConfig, file: Path, size: tuple[int, int]) -> Pixels:
             "the width of the views; remove the view from its file, set a larger data.image_size "
             "or data.ignore_masks"
         )
-    return compact_mask(mask)
+    return compact_mask(mask, store)
 
 
 def _depth_unit(frame: TransformsFrame) -> float:
@@ -297,14 +326,14 @@ def describe_extras(
     """Return the names of ignored data (distortion, motion, masks, depth) and a description."""
     lenses = list(filter(None, map(lens_of, frames)))
     found = {
-        "distortion": lenses,
+        "distortion": [lens for lens in lenses if lens.distorts],
         "motion": [f for f in frames if f.values.transform_matrix_close is not None],
         "masks": [f for f in frames if f.values.mask_path],
         "depth": [f for f in frames if f.values.depth_file_path],
     }
     ignored = tuple(k for k, have in found.items() if have and getattr(config, f"ignore_{k}"))
     text = ""
-    if names := sorted({f"{lens.kind} ({', '.join(lens.coefficients())})" for lens in lenses}):
+    if names := sorted({lens.describe() for lens in lenses}):
         text += f"; lens {' and '.join(names)}" + " ignored" * ("distortion" in ignored)
     if "masks" in ignored:
         text += "; masks (mask_path) ignored"

@@ -9,13 +9,14 @@ folders ``train`` and ``test`` or ``val`` that contain all photographs are the s
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.files import read_text
 from drgs.datasets.files import IMAGE_FOLDERS, MIN_FOUND_SHARE, key_of, parts_of, stem_of
+from drgs.datasets.types import Dataset, View
 
 SPLITS = ("train", "val", "test")
 
@@ -183,3 +184,38 @@ def _split_every_nth(config: DataConfig, source: Path, num_views: int) -> Split:
     n = config.test_every
     train = [index for index in range(num_views) if index % n]
     return Split(train, range(0, num_views, n), "test", f"every {n}th by file name")
+
+
+def leave_out(dataset: Dataset, config: DataConfig) -> Dataset:
+    """Return the dataset without the photographs of ``data.leave_out``.
+
+    Raises :class:`UserError` for a name that no photograph has, and if none is left to train on.
+    """
+    if not config.leave_out:
+        return dataset
+    views = (*dataset.train, *dataset.test)
+    for name in config.leave_out:
+        if not any(_is_named(view, name) for view in views):
+            nearest = did_you_mean(name, [view.name for view in views])
+            raise UserError(
+                f"data.leave_out: {config.path} has no photograph {one_line(name, 60)}{nearest}"
+            )
+
+    def left(views: tuple[View, ...]) -> tuple[View, ...]:
+        return tuple(v for v in views if not any(_is_named(v, n) for n in config.leave_out))
+
+    train, test = left(dataset.train), left(dataset.test)
+    if dataset.train and not train:
+        raise UserError(f"data.leave_out: no photograph is left to train on in {config.path}")
+    count = len(views) - len(train) - len(test)
+    description = f"{dataset.description}; {count} of these left out"
+    return replace(dataset, train=train, test=test, description=description)
+
+
+def _is_named(view: View, name: str) -> bool:
+    """Return whether a name is that of the view, or the end of its photograph's path."""
+    file, parts = view.files.get("image"), Path(name).parts
+    if file is None:
+        return name == view.name
+    count = len(parts)
+    return name == view.name or parts in (file.parts[-count:], file.with_suffix("").parts[-count:])

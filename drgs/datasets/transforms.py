@@ -71,6 +71,7 @@ LENS_OF_MODEL = {
     **dict.fromkeys(PLANE_MODELS, "opencv"),
     **dict.fromkeys(FISHEYE_MODELS, "fisheye"),
     "THIN_PRISM_FISHEYE": "thin_prism_fisheye",
+    "EQUIRECTANGULAR": "equirectangular",
 }
 """Lenses of COLMAP's models; other values of ``camera_model`` are names of lenses."""
 
@@ -410,8 +411,8 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
         given = {key: value for key, value in given.items() if value}
         if name == "opencv":
             name = "fisheye" if values.is_fisheye else "opencv" if given else "pinhole"
-        elif given.keys() <= {"k1", "k2", "k3", "k4"}:  # thin prisms of zero
-            name = "fisheye"
+        elif name == "thin_prism_fisheye" and given.keys() <= {"k1", "k2", "k3", "k4"}:
+            name = "fisheye"  # thin prisms of zero
     if name == "pinhole":
         return None
     is_rational = model == RATIONAL_MODEL or {"k5", "k6"} & given.keys()  # OpenCV's only
@@ -426,13 +427,18 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
     for key in sorted(given.keys() - set(lens.coefficient_names())):
         raise UserError(
             f"{frame.location(key)}: a lens of the kind {name} has the coefficients "
-            f"{', '.join(lens.coefficient_names())}, got {key} = {given[key]:g}; set "
+            f"{', '.join(lens.coefficient_names()) or 'none'}, got {key} = {given[key]:g}; set "
             f"camera_model to the model that was calibrated, or leave {key} out"
         )
     try:
         return lens.from_coefficients(**given)
     except UserError as error:
         raise UserError(f"{frame.location('camera_model')}: {error}") from error
+
+
+def panorama_intrinsics(width: int, height: int) -> tuple[float, float, float, float]:
+    """Return fx, fy (px per radian), cx and cy (px) of a film that is a whole turn."""
+    return width / (2 * math.pi), height / math.pi, width / 2, height / 2
 
 
 def motion_of(frame: TransformsFrame, samples: int) -> CameraMotion | None:

@@ -28,6 +28,8 @@ class LazyImage:
     compute: Callable[[], np.ndarray]  # returns float32
     nbytes: int  # kept in memory, beside another image's
     shifted: Callable[[int, int], np.ndarray] | None = None  # by x, y of the file's; shift_pixels
+    is_on_disk: bool = False  # reads a file at each access
+    is_elsewhere: bool = False  # another process has it: computing it raises
 
     dtype: ClassVar = np.dtype(np.float32)
 

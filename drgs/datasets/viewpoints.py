@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from drgs.datasets.transforms import (
     lens_of,
     motion_of,
     note_unread,
+    panorama_intrinsics,
     principal_point,
     read_transforms,
 )
@@ -68,9 +70,37 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> np.ndarray:
     return pose
 
 
+def panorama(view: Viewpoint, up: np.ndarray | None = None) -> Viewpoint:
+    """Return a panorama from the same place; up: (3,) world, of its middle row, None: as it is."""
+    from drgs.cameras.equirectangular import Equirectangular
+
+    pose = view.camera_to_world
+    if up is not None:
+        forward, _ = level_axes(up / np.linalg.norm(up), pose[:3, 2])
+        pose = look_at(view.center, view.center + forward, up)
+    fx, fy, cx, cy = panorama_intrinsics(view.width, view.height)
+    return replace(view, camera_to_world=pose, fx=fx, fy=fy, cx=cx, cy=cy, lens=Equirectangular())
+
+
+def level_axes(up: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two unit vectors that complete ``up``: the level part of ``towards``, and up x it."""
+    level = towards - (towards @ up) * up
+    if np.linalg.norm(level) <= 1e-6 * np.linalg.norm(towards):
+        level = np.eye(3)[np.argmin(np.abs(up))]
+        level = level - (level @ up) * up
+    level = level / np.linalg.norm(level)
+    return level, np.cross(up, level)
+
+
 def field_of_view(views: Sequence[Viewpoint]) -> float:
-    """Return the median horizontal field of view, degrees."""
-    return math.degrees(np.median([2 * math.atan(0.5 * v.width / v.fx) for v in views]))
+    """Return the median horizontal field of view, degrees; 90 of panoramas."""
+    angles = [math.pi / 2 if is_panorama(v) else 2 * math.atan(0.5 * v.width / v.fx) for v in views]
+    return math.degrees(np.median(angles))
+
+
+def is_panorama(view: Viewpoint) -> bool:
+    """Return whether the view shows all directions."""
+    return view.lens is not None and view.lens.whole_turn
 
 
 def read_viewpoints(
@@ -115,6 +145,10 @@ def _viewpoint_of(
         of = value_of(side, "the file's other numbers need it")
         return check(pixels * getattr(values, key) / of, frame.location(key), pixels)
 
+    pose, lens, motion = values.transform_matrix, lens_of(frame), motion_of(frame, shutter_samples)
+    if lens is not None and lens.whole_turn:
+        intrinsics = panorama_intrinsics(width, height)
+        return Viewpoint(name, pose, *intrinsics, width, height, lens, motion)
     cx, cy = width / 2, height / 2
     if values.fl_x is not None:
         focal = scale_length("fl_x", "w", focal_length)
@@ -126,7 +160,6 @@ def _viewpoint_of(
         cx, cy = (
             scale_length(key, side, principal_point) for key, side in (("cx", "w"), ("cy", "h"))
         )
-    pose, lens, motion = values.transform_matrix, lens_of(frame), motion_of(frame, shutter_samples)
     return Viewpoint(name, pose, focal, focal_y, cx, cy, width, height, lens, motion)
 
 
@@ -145,6 +178,8 @@ def focus_of(views: Sequence[Viewpoint]) -> tuple[np.ndarray, float]:
     """
     centers = np.stack([view.center for view in views])
     axes = np.stack([view.camera_to_world[:3, 2] for view in views])
+    if any(map(is_panorama, views)):
+        raise _no_focus("panoramas, which look in all directions")
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal = projectors.mean(axis=0)
     if len(views) == 1:

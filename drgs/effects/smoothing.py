@@ -75,7 +75,7 @@ def _rates(points: Array3f, camera: Camera) -> Float:
     beside = (film < camera.film_start - margin) | (film > camera.film_end + margin)
     # Written such that NaN is not seen.
     seen &= (film.x == film.x) & (film.y == film.y) & ~(beside.x | beside.y)
-    return dr.select(seen, dr.max(camera.focal) / depth, 0)
+    return dr.select(seen, dr.max(camera.lens.focal_lengths(camera)) / depth, 0)
 
 
 def bake_smoothing(gaussians: Gaussians) -> Gaussians:

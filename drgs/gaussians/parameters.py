@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
 import drjit as dr
 import numpy as np
@@ -23,6 +23,9 @@ from drgs.core.files import atomic_path
 from drgs.core.origin import WORLD, Origin, format_origin
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.core.types import TensorXf
+
+if TYPE_CHECKING:
+    from drgs.io.formats import Scalar
 
 Tensor = TypeVar("Tensor", bound=np.ndarray | dr.ArrayBase)  # ``np.ndarray`` or ``TensorXf``
 
@@ -57,14 +60,15 @@ class Gaussians(Generic[Tensor]):
 
         Raises ``drgs.core.errors.UserError`` (a ValueError) naming the file and what is wrong.
         """
-        from drgs.io.formats import Z_TO_Y, pop_origin, read_gaussians
+        from drgs.io.formats import UP, Z_TO_Y, pop_origin, read_gaussians
 
         extension, arrays, rendered_with = read_gaussians(path)
+        up = extension.value.up and rendered_with.pop(UP, extension.value.up)
         origin = pop_origin(path, rendered_with)
         gaussians = Gaussians(
             **arrays, features=None, rendered_with=rendered_with or None, origin=origin
         )
-        return gaussians._rotate_harmonics(Z_TO_Y.T) if extension.value.up == "y" else gaussians
+        return gaussians._rotate_harmonics(Z_TO_Y.T) if up == "y" else gaussians
 
     def save(self, path: str | Path) -> None:
         """Write a file, atomically, in the format that its suffix names: see ``drgs.io.formats``.
@@ -76,11 +80,11 @@ class Gaussians(Generic[Tensor]):
         Raises ``drgs.core.errors.UserError`` (a ValueError) for another suffix, or where the format
         cannot hold them.
         """
-        from drgs.io.formats import file_formats, format_for
+        from drgs.io.formats import format_for, writable_formats
 
         chosen = format_for(path)
         if chosen is None:
-            suffixes = ", ".join(each.value.suffix for each in file_formats())
+            suffixes = ", ".join(each.value.suffix for each in writable_formats())
             raise UserError(f"{path}: the name must end in one of {suffixes}; {HOW_TO_INSTALL}")
         content = self.to_bytes(chosen.name)
         with atomic_path(path) as temporary:
@@ -91,7 +95,16 @@ class Gaussians(Generic[Tensor]):
 
         As ``save`` writes it, which see.
         """
-        from drgs.io.formats import FORMATS, ORIGIN, Z_TO_Y, encode
+        from drgs.io.formats import encode
+
+        return encode(name, *self.arrays_for(name))
+
+    def arrays_for(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
+        """Return the arguments of ``drgs.io.formats.encode``, in the axes of the format ``name``.
+
+        A ``UserNote`` names what the format has no room for.
+        """
+        from drgs.io.formats import FORMATS, ORIGIN, Z_TO_Y
 
         chosen, host = FORMATS.get(name).value, self.numpy()
         values = dict(self.rendered_with or {})
@@ -105,7 +118,7 @@ class Gaussians(Generic[Tensor]):
         host = host._rotate_harmonics(Z_TO_Y) if chosen.up == "y" else host
         if self.origin != WORLD:
             values |= dict(zip(ORIGIN, host.origin, strict=True))
-        return encode(name, {n: getattr(host, n) for n in host._names}, values)
+        return {n: getattr(host, n) for n in host._names}, values
 
     @staticmethod
     def from_numpy(

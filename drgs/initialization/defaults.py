@@ -106,8 +106,8 @@ def _is_cut_out(dataset: Dataset) -> bool:
     from drgs.initialization.visual_hull import MAX_EMPTY_ALPHA, MIN_TRANSPARENT_SHARE
 
     some = dataset.train[:: -(-len(dataset.train) // NUM_ALPHA_VIEWS) or 1]
-    alphas = [np.asarray(view.alpha) for view in some if view.alpha is not None]
-    shares = [float(np.mean(alpha <= MAX_EMPTY_ALPHA)) for alpha in alphas]
+    alphas = (np.asarray(view.alpha) for view in some if view.alpha is not None)
+    shares = [float(np.mean(alpha <= MAX_EMPTY_ALPHA)) for alpha in alphas]  # one at a time
     return sum(share >= MIN_TRANSPARENT_SHARE for share in shares) > len(some) / 2
 
 

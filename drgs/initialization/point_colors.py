@@ -14,17 +14,13 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from drgs.core.environment import denormals_kept
+from drgs.datasets.film import is_projectable, shown_points
 from drgs.datasets.types import View
-from drgs.initialization.film import is_projectable, to_camera, to_film
 
 MAX_VIEWS, MIN_VIEWS = 60, 8
 """Number of views whose images are read: a third of them see most points."""
 
 MAX_BYTES = 1 << 27  # memory for colours: of a million points, fewer views are read
-
-PIXEL_WIDTH, MAX_BEHIND = 1.5, 1.5
-"""Width of a pixel of the z-buffer, and largest distance behind its depth of shown points, in
-distances of the points. In smaller pixels, points are seen through gaps of a surface."""
 
 MIN_ALPHA = 0.5  # less opaque pixels mostly show the background
 
@@ -74,19 +70,9 @@ def _find_shown_points(
     background: tuple[float, float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return indices of points that the image shows, and their colours (M, 3) float32, 0..1."""
-    u, v, depth = to_film(view, to_camera(view, columns))
-    on_film = (depth > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
-    rows = np.flatnonzero(on_film)
+    rows, at, _ = shown_points(view, columns, spacing)
     if not len(rows):
         return rows, np.empty((0, 3), np.float32)
-    u, v, depth = u[rows], v[rows], depth[rows]
-    pixel = max(1.0, PIXEL_WIDTH * view.fx * float(np.median(spacing[rows] / depth)))
-    place = np.floor(v / pixel).astype(np.int64) * (int(view.width / pixel) + 1)
-    place += np.floor(u / pixel).astype(np.int64)
-    nearest = np.full(place.max() + 1, np.inf)
-    np.minimum.at(nearest, place, depth)
-    seen = depth <= nearest[place] + MAX_BEHIND * spacing[rows]
-    rows, at = rows[seen], (v[seen].astype(np.int64), u[seen].astype(np.int64))
     colors, opaque = np.asarray(view.image)[at], np.ones(len(rows), bool)
     if view.alpha is not None:
         alpha = np.asarray(view.alpha)[at][:, None]

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from typing_extensions import override
 
 from drgs.config.schema import InitConfig
 from drgs.core.errors import UserError
+from drgs.datasets.film import to_camera, to_film
 from drgs.datasets.types import Dataset, Viewpoint
-from drgs.datasets.viewpoints import focus_of
+from drgs.datasets.viewpoints import focus_of, is_panorama
 
 MIN_DISTANCE = 0.25  # of starting points to cameras, in distances to the focus
 
@@ -133,6 +134,8 @@ def _near_and_far(count: int, rng: np.random.Generator) -> np.ndarray:
 
 def _in_image(points: np.ndarray, view: Viewpoint, part: float = 1.0) -> np.ndarray:
     """Return whether (N,) points are in the middle ``part`` of the image's width and height."""
+    if is_panorama(view):
+        return np.full(len(points), True)
     x, y, z = ((points - view.center) @ view.camera_to_world[:3, :3]).T
     # In pixels times z, so that nothing is divided by a depth near zero.
     u, v = view.fx * x + view.cx * z, view.fy * y + view.cy * z
@@ -181,8 +184,8 @@ def check_box(box: Box, dataset: Dataset) -> None:
 def _coverage(points: np.ndarray, view: Viewpoint) -> float:
     """Return the share of an image's cells that contain points; lenses are taken for pinholes."""
     seen = points[_in_image(points, view)]
-    x, y, z = ((seen - view.center) @ view.camera_to_world[:3, :3]).T
-    u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
+    shown_by = view if is_panorama(view) else replace(view, lens=None)
+    u, v, _ = to_film(shown_by, to_camera(view, list(seen.T)))
     cells = np.floor(NUM_CELLS * np.stack([u / view.width, v / view.height]))
     return np.unique(cells, axis=1).shape[1] / NUM_CELLS**2
 

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from drgs.core.environment import denormals_kept
+from drgs.datasets.film import Columns, is_projectable, to_camera, to_film
 from drgs.datasets.types import View
-from drgs.initialization.film import Columns, is_projectable, to_camera, to_film
 from drgs.initialization.start_box import Box
 
 MAX_EMPTY_ALPHA = 4 / 255  # of empty pixels: mattes have noise

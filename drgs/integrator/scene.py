@@ -50,10 +50,9 @@ def check_lenses(model: ModelConfig, views: Iterable[Viewpoint], where: str, rem
     bent = next(((view.name, view.lens) for view in views if view.lens is not None), None)
     if model.projection == "exact" and bent is not None:
         name, lens = bent
-        names = ", ".join(lens.coefficients())
         raise UserError(
             f"{where}model.projection must be ewa or unscented for lenses that are no pinholes, "
-            f"such as that of view {name} ({lens.kind}: {names}), got exact; or {remedy}"
+            f"such as that of view {name}, {lens.describe()}, got exact; or {remedy}"
         )
 
 
@@ -105,6 +104,7 @@ def _sensor(view: Viewpoint, calibrated: bool) -> dict[str, object]:
         return pose | _perspective(view)
     intrinsics = {name: getattr(view, name) for name in ("fx", "fy", "cx", "cy")}
     if view.lens is not None:
+        intrinsics = {} if view.lens.whole_turn else intrinsics
         intrinsics |= {"lens": view.lens.kind, **view.lens.coefficients()}
     if view.motion is not None:
         pose["to_world_close"] = _to_world(view.motion.close_to_world)

@@ -51,7 +51,7 @@ class BackwardResult:
         plane: Float (H * W,). The weight is alpha times transmittance, averaged over samples and
         times. Call it before a parameter changes.
         """
-        sums = [rendering.weighted_sums(frame, plane) for frame in self.frames]
+        sums = [rendering.weighted_sums(frame, plane)[0] for frame in self.frames]
         return sum(sums[1:], sums[0]) / sum(frame.bins.grid.samples for frame in self.frames)
 
 

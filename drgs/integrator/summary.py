@@ -165,7 +165,7 @@ def view_dependence_effect(degree: int, why: str) -> SimulatedEffect:
 def lens_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras") -> SimulatedEffect:
     """Summarise lenses that are no pinholes; of: all cameras, in words."""
     bent = [view.lens for view in views if view.lens is not None]
-    kinds = sorted({f"{lens.kind} ({', '.join(lens.coefficients())})" for lens in bent})
+    kinds = sorted({lens.describe() for lens in bent})
     return SimulatedEffect("lens distortion", " and ".join(kinds) or None, f"{len(bent)} of {of}")
 
 

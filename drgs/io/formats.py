@@ -41,6 +41,8 @@ wxyz, ``log_scales`` (N, 3), ``logit_opacities`` (N,), ``sh0`` (N, 1, 3), ``shN`
 
 ORIGIN = ("origin_x", "origin_y", "origin_z")  # in ``rendered_with``: world, of the means
 
+UP = "up"  # in ``rendered_with`` of a file that records its axis: ``"y"`` or ``"z"``
+
 MAX_ORIGIN = 1e12  # world units
 
 Z_TO_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -52,10 +54,12 @@ class FileFormat:
 
     ``rendered_with`` contains by name the approximations that Gaussians are to be rendered with
     (:class:`drgs.config.approximations.Approximations`), and their origin (:data:`ORIGIN`) if it is
-    not the world's.
+    not the world's. What is read may contain :data:`UP`, which overrides :attr:`up`.
     """
 
     suffix: str  # end of file names, in small letters, such as ``.npz``
+
+    other_names: frozenset[str] = frozenset()  # of files that are read: whole ones, and suffixes
 
     description: str  # one phrase, for help texts
 
@@ -107,8 +111,10 @@ FORMATS: Registry[type[FileFormat]] = Registry(
         "ply": "drgs.io.ply",
         "compressed-ply": "drgs.io.compressed_ply",
         "spz": "drgs.io.spz",
+        "sog": "drgs.io.sog",
         "glb": "drgs.io.glb",
         "splat": "drgs.io.splat",
+        "ksplat": "drgs.io.ksplat",
         "usd": "drgs.io.usd",
     },
 )
@@ -122,6 +128,11 @@ def file_formats() -> list[Extension[type[FileFormat]]]:
 def readable_formats() -> list[Extension[type[FileFormat]]]:
     """Return the formats whose files can be read."""
     return [each for each in file_formats() if each.value.read is not FileFormat.read]
+
+
+def writable_formats() -> list[Extension[type[FileFormat]]]:
+    """Return the formats whose files can be written."""
+    return [each for each in file_formats() if each.value.encode is not FileFormat.encode]
 
 
 def _shipped_formats() -> list[Extension[type[FileFormat]]]:
@@ -140,6 +151,13 @@ def format_for(path: str | Path) -> Extension[type[FileFormat]] | None:
     return None
 
 
+def format_to_read(path: str | Path) -> Extension[type[FileFormat]] | None:
+    """Return the format of :func:`format_for`, or one that reads files of such a name."""
+    names = {Path(path).name.lower(), Path(path).suffix.lower()}
+    others = (each for each in _shipped_formats() if names & each.value.other_names)
+    return format_for(path) or next(others, None)
+
+
 def read_gaussians(
     path: str | Path,
 ) -> tuple[Extension[type[FileFormat]], dict[str, np.ndarray], dict[str, Scalar]]:
@@ -149,7 +167,7 @@ def read_gaussians(
     suffix, the content decides. Raises as :meth:`FileFormat.read`.
     """
     open_regular(path).close()
-    named = format_for(path) or FORMATS.get("ply")
+    named = format_to_read(path) or FORMATS.get("ply")
     last = "." + named.value.suffix.rpartition(".")[2]
     others = [each for each in _shipped_formats() if each.value.suffix.endswith(last)]
     for extension in (named, *(each for each in others if each is not named)):
@@ -172,6 +190,15 @@ def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) ->
     Raises :class:`UserError` for Gaussians that the format cannot hold.
     """
     extension = FORMATS.get(name)
+    check(name, gaussians)
+    kept = {k: v for k, v in rendered_with.items() if extension.value.holds(k)}
+    with extension.reporting():
+        return extension.value().encode(gaussians, kept)
+
+
+def check(name: str, gaussians: Arrays) -> None:
+    """Raise :class:`UserError` for Gaussians that the format ``name`` cannot hold."""
+    extension = FORMATS.get(name)
     if "smoothing" in gaussians and not extension.value.has_smoothing:
         raise UserError(
             f"the format {name} has no room for the smoothing of Gaussians: bake it into them "
@@ -181,9 +208,6 @@ def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) ->
         if not len(gaussians["means"]):
             raise UserError(f"the format {name} needs at least one Gaussian, got none")
         _check_finite(gaussians, f"the format {name} holds finite numbers: ")
-    kept = {k: v for k, v in rendered_with.items() if extension.value.holds(k)}
-    with extension.reporting():
-        return extension.value().encode(gaussians, kept)
 
 
 def _check_arrays(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:

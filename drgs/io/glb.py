@@ -365,7 +365,7 @@ class _Document:
     def _item(self, key: str, items: list[object], index: int, kind: type[Part]) -> Part:
         if index >= len(items):
             raise UserError(f"{self.path}: {key}[{index}] must be there, got {len(items)} of them")
-        return _validate_part(self.path, f"{key}[{index}].", kind, items[index])
+        return validate_part(self.path, f"{key}[{index}].", kind, items[index])
 
 
 def _read_document(path: Path, text: bytes, binary: bytes, start: int) -> _Document:
@@ -373,7 +373,7 @@ def _read_document(path: Path, text: bytes, binary: bytes, start: int) -> _Docum
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: the JSON part is not valid: {one_line(error)}") from None
-    file = _validate_part(path, "", _File, content)
+    file = validate_part(path, "", _File, content)
     found = [
         (mesh, index)
         for mesh, each in enumerate(file.meshes)
@@ -386,7 +386,7 @@ def _read_document(path: Path, text: bytes, binary: bytes, start: int) -> _Docum
         )
     mesh, index = found[0]
     place = f"meshes[{mesh}].primitives[{index}]"
-    primitive = _validate_part(path, f"{place}.", _Primitive, file.meshes[mesh].primitives[index])
+    primitive = validate_part(path, f"{place}.", _Primitive, file.meshes[mesh].primitives[index])
     missing = [name for name in REQUIRED if name not in primitive.attributes]
     if missing:
         raise UserError(f"{path}: {place}: attributes {', '.join(missing)} are missing")
@@ -394,7 +394,8 @@ def _read_document(path: Path, text: bytes, binary: bytes, start: int) -> _Docum
     return _Document(path, place, primitive, file, translation, binary, start)
 
 
-def _validate_part(path: Path, place: str, kind: type[Part], content: object) -> Part:
+def validate_part(path: Path, place: str, kind: type[Part], content: object) -> Part:
+    """Return a part of a JSON document; place: its start, for messages; raise UserError."""
     try:
         return kind.model_validate(content)
     except ValidationError as failed:

@@ -172,7 +172,9 @@ def read_image(path: Path) -> np.ndarray:
 
 def as_numbers(pixels: np.ndarray) -> np.ndarray:
     """Return float32 in 0..1 for pixels of :func:`read_pixels`."""
-    return pixels.astype(np.float32) / np.float32(255 if pixels.dtype == np.uint8 else MAX_16_BITS)
+    numbers = pixels.astype(np.float32)
+    numbers /= np.float32(255 if pixels.dtype == np.uint8 else MAX_16_BITS)
+    return numbers
 
 
 def check_readable(path: Path) -> None:

@@ -15,6 +15,9 @@ is an origin other than the world's::
     comment drgs antialiased true
     comment drgs low_pass 0.1
     comment drgs origin_x 4200000.0
+
+Compensated opacities are marked for other programs as well, and read from their marks: ``comment
+SplatRenderMode: mip`` (Brush, gsplat) and ``comment postshot.anti_aliasing=1``.
 """
 
 from __future__ import annotations
@@ -56,7 +59,13 @@ MEMORY_RATIO = 3  # memory that reading takes, in bytes of the rows: measured 2.
 MAX_HEADER_BYTES = 1 << 20  # the header of 62 properties takes 1.5 kB; the rest is for comments
 
 STATEMENT = re.compile(r"drgs ([a-z][a-z_]{0,39}) ([!-~]{1,40})")
-"""A comment of ours: a name and its value. Others are ignored."""
+"""A comment of ours: a name and its value. Others but the following are ignored."""
+
+MIP = "SplatRenderMode: mip"
+ANTIALIASED = re.compile(
+    r"SplatRenderMode: *mip|postshot\.anti_aliasing *= *1|antialiased 1", re.IGNORECASE
+)
+"""Comments of Brush and of Postshot's versions for ``antialiased``, which ours override."""
 
 
 @FORMATS.register("ply")
@@ -146,6 +155,8 @@ def encode_elements(
             raise ValueError(
                 f"rendered_with must be names and values of one word, got {name!r}: {value!r}"
             )
+    if (rendered_with or {}).get("antialiased") is True:
+        comments.append(MIP)
     described = [PlyElement.describe(rows, name) for name, rows in elements.items()]
     file = io.BytesIO()
     PlyData(described, byte_order="<", comments=comments).write(file)
@@ -264,7 +275,7 @@ def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
 def _statements(path: str | Path, lines: list[bytes]) -> dict[str, Scalar]:
     found: dict[str, str] = {}
     comments = [line.removeprefix(b"comment ") for line in lines if line.startswith(b"comment ")]
-    texts = (comment.decode("ascii", "replace").strip() for comment in comments)
+    texts = [comment.decode("ascii", "replace").strip() for comment in comments]
     for match in filter(None, map(STATEMENT.fullmatch, texts)):
         name, text = match.groups()
         if found.setdefault(name, text) != text:
@@ -272,6 +283,8 @@ def _statements(path: str | Path, lines: list[bytes]) -> dict[str, Scalar]:
                 f"{path}: the header's comments must give {name} once, got {found[name]} and "
                 f"{text}; remove one of the lines"
             )
+    if any(map(ANTIALIASED.fullmatch, texts)):
+        found.setdefault("antialiased", "true")
     return {name: _scalar(text) for name, text in found.items()}
 
 

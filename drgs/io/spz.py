@@ -65,6 +65,8 @@ FRACTIONAL_BITS = 12
 
 MIN_FRACTIONAL_BITS = 16
 
+MAX_DEGREE = 3  # of harmonics that are kept; files have up to 4
+
 COLOR_SCALE = 0.15
 SCALE_STEPS, LOG_SCALE_LOW = 16, -10
 QUATERNION_LEVELS = 511
@@ -91,7 +93,7 @@ class Spz(FileFormat):
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         """Return Gaussians, y up, and whether ``antialiased``.
 
-        Extensions of vendors are passed over, with a :class:`UserNote`.
+        Extensions of vendors and harmonics of degree 4 are passed over, with a :class:`UserNote`.
         """
         content = read_bytes(path, "file", MAX_BYTES)
         if content.startswith(GZIP_MAGIC):
@@ -103,6 +105,9 @@ class Spz(FileFormat):
                 f"{Place(path, 'byte', 0)}: must begin as gzip does, or with {MAGIC.decode()}: "
                 "not an SPZ file"
             )
+        if header.degree > MAX_DEGREE:
+            note = f"harmonics of degree {header.degree}: read to degree {MAX_DEGREE}"
+            warnings.warn(UserNote(f"{path}: {note}"), stacklevel=2)
         if header.flags & EXTENSIONS:
             note = "has extensions of a vendor, which are passed over; one may mean other axes"
             warnings.warn(UserNote(f"{path}: {note}"), stacklevel=2)
@@ -110,6 +115,7 @@ class Spz(FileFormat):
             np.frombuffer(part, "u1").reshape(header.num, -1) if part else np.zeros((header.num, 0))
             for part in parts
         )
+        harmonics = harmonics[:, : 3 * ((MAX_DEGREE + 1) ** 2 - 1)]
         arrays = {
             "means": _unpacked_positions(positions) / 2.0**header.fractional_bits,
             "quats": _unpacked_rotations(rotations, header.version),
@@ -249,7 +255,7 @@ def _checked_header(path: Path, fields: tuple, versions: tuple[int, ...]) -> _He
     for name, value, least, most in (
         ("the version", version, versions[0], versions[-1]),
         ("the number of Gaussians", num, 1, 2**32 - 1),
-        ("the degree of harmonics", degree, 0, 3),
+        ("the degree of harmonics", degree, 0, 4),
         ("the number of fractional bits of positions", bits, 0, POSITION_BITS),
     ):
         if not least <= value <= most:

@@ -1,27 +1,38 @@
-"""USD: Gaussians as a ``ParticleField3DGaussianSplat``; written, not read. The extra ``usd``.
+"""USD: Gaussians as a ``ParticleField3DGaussianSplat``. The extra ``usd``.
 
 The schema is that of OpenUSD's ``usdVol``, from version 26.03 on: positions, orientations (unit
 quaternions wxyz), linear scales, opacities after the sigmoid, and harmonics Gaussian by Gaussian in
-the order and with the signs of the 3DGS reference. In the stage, z is up and colours are in display
-space.
+the order and with the signs of the 3DGS reference. In stages that are written, z is up and colours
+are in display space. Stages with y up, half precision and animated ones, at their first time, are
+read as well; a prim may be moved, but not turned or scaled.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from typing_extensions import override
 
 from drgs.core.environment import require_module
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote, one_line
+from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD
-from drgs.io.formats import FORMATS, ORIGIN, Arrays, FileFormat, Scalar, pop_origin
-from drgs.io.quantization import normalize_quaternions, opacities_from_logits
+from drgs.io.formats import FORMATS, ORIGIN, UP, Arrays, FileFormat, Scalar, pop_origin
+from drgs.io.quantization import (
+    log_scales_from_scales,
+    logits_from_opacities,
+    normalize_quaternions,
+    opacities_from_logits,
+    require_scene_memory,
+)
 
 PRIM = "/Gaussians"
 
@@ -35,20 +46,28 @@ class Usd(FileFormat):
     """OpenUSD's particle fields."""
 
     suffix = ".usdc"
-    description = "OpenUSD's ParticleField3DGaussianSplat (extra usd), written only"
+    other_names = frozenset({".usd", ".usda", ".usdz"})
+    description = "OpenUSD's ParticleField3DGaussianSplat (extra usd)"
     up = "z"
     metadata = frozenset(ORIGIN)
 
     @override
+    def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        """Return the Gaussians of the only prim of this kind, its translation, and the axis up."""
+        modules = _import_openusd("Gf", "Usd", "UsdGeom", "UsdVol")
+        require_memory(path, 2 * path.stat().st_size, "the file")
+        try:
+            return _read_stage(path, *modules)
+        except (UserError, MemoryError):
+            raise
+        except Exception as error:  # Tf.ErrorException: places in OpenUSD's code, and reasons
+            reason = one_line(str(error).rpartition(" : ")[2], 200)
+            raise UserError(f"{path}: not a valid USD file: {reason}") from None
+
+    @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         """Return a binary USD file, in which the origin is the translation of the prim."""
-        require_module("pxr", "usd", "USD")
-        # OpenUSD has no stubs.
-        Sdf, Usd, UsdGeom, UsdVol, Vt = (
-            import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom", "UsdVol", "Vt")
-        )
-        if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
-            raise UserError("USD needs OpenUSD 26.03 or newer: pip install 'drgs[usd]'")
+        Sdf, Usd, UsdGeom, UsdVol, Vt = _import_openusd("Sdf", "Usd", "UsdGeom", "UsdVol", "Vt")
         g = gaussians
         stage = Usd.Stage.CreateInMemory()
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -78,6 +97,90 @@ class Usd(FileFormat):
             path = Path(folder) / "gaussians.usdc"
             stage.GetRootLayer().Export(str(path))
             return path.read_bytes()
+
+
+def _import_openusd(*names: str) -> list[Any]:
+    """Return modules of OpenUSD, which has no stubs."""
+    require_module("pxr", "usd", "USD")
+    if not hasattr(import_module("pxr.UsdVol"), "ParticleField3DGaussianSplat"):
+        raise UserError("USD needs OpenUSD 26.03 or newer: pip install 'drgs[usd]'")
+    return [import_module(f"pxr.{name}") for name in names]
+
+
+def _read_stage(
+    path: Path, Gf: Any, Usd: Any, UsdGeom: Any, UsdVol: Any
+) -> tuple[Arrays, Mapping[str, Scalar]]:
+    stage = Usd.Stage.Open(str(path))
+    prims = [p for p in stage.Traverse() if p.IsA(UsdVol.ParticleField3DGaussianSplat)]
+    if len(prims) != 1:
+        raise UserError(
+            f"{path}: must have one ParticleField3DGaussianSplat, got {len(prims) or 'none'}"
+        )
+    place, time = f"{path}: prim {prims[0].GetPath()}", Usd.TimeCode.EarliestTime()
+    space = Usd.ColorSpaceAPI(prims[0]).GetColorSpaceNameAttr().Get()
+    if space not in (None, "", COLOR_SPACE):
+        note = f"colours of the space {one_line(space, 40)} are read as of {COLOR_SPACE}"
+        warnings.warn(UserNote(f"{place}: {note}"), stacklevel=2)
+    to_world = UsdGeom.Xformable(prims[0]).ComputeLocalToWorldTransform(time)
+    origin = to_world.ExtractTranslation()
+    if to_world != Gf.Matrix4d().SetTranslate(origin):
+        raise UserError(
+            f"{place}: splats that a prim rotates or scales are not read; apply it to them in "
+            "the program that wrote the file"
+        )
+    read = partial(_read_attribute, place, UsdVol.ParticleField3DGaussianSplat(prims[0]), time)
+    means = read("Positions", 3)
+    num = len(means)
+    quats_xyzw, scales = read("Orientations", 4, num), read("Scales", 3, num, 0)
+    opacities = read("Opacities", 1, num, 0, 1)[:, 0]
+    harmonics = read("RadianceSphericalHarmonicsCoefficients", 3)
+    per_gaussian, rest = divmod(len(harmonics), num)
+    if rest or per_gaussian not in (1, 4, 9, 16):
+        raise UserError(
+            f"{place}: RadianceSphericalHarmonicsCoefficients: 1, 4, 9 or 16 for each of "
+            f"{num:,} Gaussians were expected, got {len(harmonics):,}"
+        )
+    require_scene_memory(path, num, per_gaussian, turned=True)
+    harmonics = harmonics.reshape(num, per_gaussian, 3)
+    arrays = {
+        "means": means,
+        "quats": np.roll(quats_xyzw, 1, axis=1),
+        "log_scales": log_scales_from_scales(scales),
+        "logit_opacities": logits_from_opacities(opacities),
+        "sh0": harmonics[:, :1],
+        "shN": harmonics[:, 1:],
+    }
+    rendered_with: dict[str, Scalar] = {UP: UsdGeom.GetStageUpAxis(stage).lower()}
+    if tuple(origin) != WORLD:
+        rendered_with |= zip(ORIGIN, map(float, origin), strict=True)
+    return arrays, rendered_with
+
+
+def _read_attribute(
+    place: str,
+    field: Any,
+    time: object,
+    name: str,
+    width: int,
+    num: int | None = None,
+    least: float = -np.inf,
+    most: float = np.inf,
+) -> np.ndarray:
+    """Return an attribute (N, width) of single or else half precision."""
+    values = getattr(field, f"Get{name}Attr")().Get(time)
+    if not values:
+        values = getattr(field, f"Get{name}hAttr")().Get(time)
+    rows = np.asarray(values or [], np.float32).reshape(-1, width)
+    if not len(rows) or num not in (None, len(rows)):
+        expected = "at least one" if num is None else f"{num:,} of them"
+        raise UserError(f"{place}: {name}: {expected} expected, got {len(rows):,}")
+    bad = np.argwhere(~((rows >= least) & (rows <= most)))
+    if len(bad):
+        raise UserError(
+            f"{place}: {name} of Gaussian {bad[0][0]} must be from {least:g} to {most:g}, got "
+            f"{rows[tuple(bad[0])]}"
+        )
+    return rows
 
 
 def _float32(values: ArrayLike) -> np.ndarray:

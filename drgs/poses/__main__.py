@@ -66,6 +66,12 @@ def add_arguments(parser: CommandParser) -> None:
         f"frames of a video; auto: all of up to {ALL_PAIRS} photographs (default: %(default)s)",
     )
     parser.add_argument(
+        "--mapper",
+        choices=("incremental", "global"),
+        default=usual.mapper,
+        help="place one photograph after another, or all at once (default: %(default)s)",
+    )
+    parser.add_argument(
         "--overwrite", action="store_true", help="replace the model that an earlier run wrote"
     )
     parser.set_defaults(run=run, prog=parser.prog)
@@ -74,7 +80,7 @@ def add_arguments(parser: CommandParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Run the command."""
     started = time.perf_counter()
-    settings = SfmSettings(args.camera_model, args.compare, args.share)
+    settings = SfmSettings(args.camera_model, args.compare, args.share, args.mapper)
     with ExitStack() as stack:
         result = reconstruct(args.folder, settings, args.overwrite, _Steps(stack).update)
     print(description_of(result, settings))

@@ -116,6 +116,14 @@ class Lens:
         """
         return None
 
+    def period(self, camera: Camera) -> float | None:
+        """Return after how many px along x the film shows the same again; None: it does not."""
+        return None
+
+    def derivative_steps(self, points: np.ndarray) -> np.ndarray:
+        """Return (M,), world units: lengths within which ``film_points`` is smooth at points."""
+        return np.linalg.norm(points, axis=1)
+
 
 @dataclass(frozen=True)
 class Pinhole(Lens):
@@ -369,6 +377,36 @@ class Orthographic(Lens):
         return np.tile(forward, (len(means), 1))
 
 
+@dataclass(frozen=True)
+class Equirectangular(Lens):
+    """All directions on one film: x is the longitude, y the latitude.
+
+    With theta = atan2(x, z) and phi = atan2(y, sqrt(x^2 + z^2)), film =
+    (W (theta / (2 pi) + 1/2), H (phi / pi + 1/2)). W and H are those of the film, px: focal
+    lengths and principal point are not used.
+    """
+
+    @override
+    def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        x, y, z = points.T
+        angles = np.column_stack([np.arctan2(x, z) / 2, np.arctan2(y, np.hypot(x, z))])
+        return np.array([camera.width, camera.height]) * (angles / np.pi + 0.5)
+
+    @override
+    def depths(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return (M,): distances from the camera's centre, world units."""
+        return np.linalg.norm(points, axis=1)
+
+    @override
+    def period(self, camera: Camera) -> float:
+        return float(camera.width)
+
+    @override
+    def derivative_steps(self, points: np.ndarray) -> np.ndarray:
+        """Return (M,): distances from the vertical axis."""
+        return np.hypot(points[:, 0], points[:, 2])
+
+
 def _jacobians(lens: OpenCV | ThinPrismFisheye, places: np.ndarray) -> np.ndarray:
     """Return (M, 2, 2): derivatives of ``lens.distort`` at places (M, 2), by complex steps."""
     columns = [np.imag(lens.distort(places + 1e-30j * axis)) / 1e-30 for axis in np.eye(2)]
@@ -556,7 +594,7 @@ def jacobians(lens: Lens, camera: Camera, points: np.ndarray) -> np.ndarray:
 
     Points are in camera axes. Central differences of order 8: see DIFFERENCE_STEP.
     """
-    steps = DIFFERENCE_STEP * np.linalg.norm(points, axis=1)[:, None]
+    steps = DIFFERENCE_STEP * lens.derivative_steps(points)[:, None]
     columns = []
     for axis in np.eye(3):
         differences = [
@@ -564,8 +602,17 @@ def jacobians(lens: Lens, camera: Camera, points: np.ndarray) -> np.ndarray:
             - lens.film_points(camera, points - j * steps * axis)
             for j in range(1, len(CENTRAL_WEIGHTS) + 1)
         ]
+        differences = [_nearest(each, lens.period(camera)) for each in differences]
         columns.append(np.tensordot(CENTRAL_WEIGHTS, differences, axes=1) / steps)
     return np.stack(columns, axis=-1)
+
+
+def _nearest(differences: np.ndarray, period: float | None) -> np.ndarray:
+    """Return differences (M, 2) of points on the film, px, across its border where that is less."""
+    if period is None:
+        return differences
+    turns = np.round(differences[:, :1] / period)
+    return differences - period * np.hstack([turns, 0 * turns])
 
 
 def _points_of_jacobian(lens: Lens, camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -627,7 +674,7 @@ def render(
     return reference.composite(
         splats.means2d, splats.conics, splats.opacities,
         sh_colors(gaussians, camera, lens, degree), splats.depths, splats.visible,
-        background, camera.width, camera.height, threshold_width, splats.cuts,
+        background, camera.width, camera.height, threshold_width, splats.cuts, lens.period(camera),
     )  # fmt: skip
 
 

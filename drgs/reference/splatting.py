@@ -425,11 +425,17 @@ class _Footprint:
 
 
 def _footprint(
-    box: tuple[slice, slice], mean2d: np.ndarray, conic: np.ndarray, opacity: float | np.ndarray
+    box: tuple[slice, slice],
+    mean2d: np.ndarray,
+    conic: np.ndarray,
+    opacity: float | np.ndarray,
+    period: float | None = None,
 ) -> _Footprint:
     """Evaluate G(d) = exp(-d^T A d / 2) (3DGS, equation 4, on the film) in a box of pixels."""
     rows, columns = box
     dx = (np.arange(columns.start, columns.stop) + 0.5 - mean2d[0])[None, :]
+    if period is not None:
+        dx = dx - period * np.round(dx / period)
     dy = (np.arange(rows.start, rows.stop) + 0.5 - mean2d[1])[:, None]
     a, b, c = conic[0, 0], conic[0, 1], conic[1, 1]
     falloff = np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
@@ -487,6 +493,7 @@ def composite(
     height: int,
     threshold_width: float = THRESHOLD_WIDTH,
     cuts: np.ndarray | float | None = None,
+    period: float | None = None,
 ) -> RenderedImage:
     """Return the image of N splats: C = sum_i T_i alpha_i c_i + T background (3DGS, equation 3).
 
@@ -501,10 +508,13 @@ def composite(
     threshold within which ``RenderedImage.near_threshold`` marks a pixel. Marked are pixels at
     which an alpha, evaluated before the pixel is finished, is that close to the cut or (before
     clamping) to the clamp, or the transmittance behind a splat is that close to the stop.
+
+    period: px along x after which a splat is seen again, of which a pixel has the nearest; None:
+    never.
     """
     rendered, _ = composite_and_stops(
         means2d, conics, opacities, colors, depths, visible, background, width, height,
-        threshold_width, cuts,
+        threshold_width, cuts, period,
     )  # fmt: skip
     return rendered
 
@@ -521,6 +531,7 @@ def composite_and_stops(
     height: int,
     threshold_width: float,
     cuts: np.ndarray | float | None = None,
+    period: float | None = None,
 ) -> tuple[RenderedImage, np.ndarray]:
     """Return ``composite``'s image and the rank in depth (H, W) at which each pixel stopped."""
     means2d, conics, opacities, colors, depths, background = _as_float64(
@@ -530,6 +541,8 @@ def composite_and_stops(
     cuts = np.broadcast_to(ALPHA_CUT if cuts is None else cuts, depths.shape)
     smallest = cuts[order] * (1 - threshold_width)
     boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], smallest, width, height)
+    if period is not None:
+        boxes = [(rows, slice(0, width)) for rows, _ in boxes]
     never = len(order)
 
     def is_near(values: np.ndarray, threshold: float | np.ndarray) -> np.ndarray:
@@ -541,7 +554,7 @@ def composite_and_stops(
     stops = np.full((height, width), never)
     near_threshold = np.zeros((height, width), dtype=bool)
     for rank, (i, box) in enumerate(zip(order, boxes, strict=True)):
-        splat = _footprint(box, means2d[i], conics[i], opacities[i])
+        splat = _footprint(box, means2d[i], conics[i], opacities[i], period)
         alpha = np.minimum(splat.raw_alpha, ALPHA_MAX)
         unfinished = stops[box] == never
         contributes = unfinished & (alpha >= cuts[i])

@@ -18,6 +18,8 @@ SIDE_BY_SIDE = "side_by_side"  # the same, with the photograph and the differenc
 CAMERAS = "cameras.json"  # refined cameras of the training views
 VIEWS = "views.json"  # the dataset's cameras of the training views, for orbits
 COLORS = "colors.json"  # colour transforms of the training views
+PHOTOMETRY = "photometry.json"  # vignetting and response of the training views' cameras
+EXAMINATION = "examination.json"  # which effects an examination chose, with the evidence
 BUDGET_PLAN = "plan.txt"  # the plan for a budget of time, with reasons
 TENSORBOARD = "tensorboard"  # a folder, with ``--tensorboard``
 EVENTS = f"{TENSORBOARD}/events.out.tfevents.fit"  # TensorBoard finds the word in the middle
@@ -25,8 +27,18 @@ METRICS = "metrics.json"  # written last
 ERROR_BUDGET = "error_budget.json"  # of ``drgs render --error``
 
 RESULTS = (
-    *(CAMERAS, CHECKPOINT, COLORS, CURVES, DENSITY, HISTORY, METRICS, ORBIT_GIF, ORBIT),
-    *(BUDGET_PLAN, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, RENDERS, REPORT, SIDE_BY_SIDE, TENSORBOARD),
+    *(CAMERAS, CHECKPOINT, COLORS, CURVES, DENSITY, EXAMINATION, HISTORY, METRICS, ORBIT),
+    PHOTOMETRY,
+    *(
+        ORBIT_GIF,
+        BUDGET_PLAN,
+        GAUSSIANS,
+        GAUSSIANS_FOR_VIEWERS,
+        RENDERS,
+        REPORT,
+        SIDE_BY_SIDE,
+        TENSORBOARD,
+    ),
     *(VIEWER, VIEWS),
 )
 """Files of a fit but for ``config.yml``."""

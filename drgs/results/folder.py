@@ -24,6 +24,7 @@ from drgs.results.files import (
     CHECKPOINT,
     CONFIG,
     EVENTS,
+    EXAMINATION,
     METRICS,
     RENDERS,
     RESULTS,
@@ -38,7 +39,8 @@ FOLDERS = (RENDERS, SIDE_BY_SIDE, TENSORBOARD)  # results that are folders
 SECTIONS = {"data", "init", "model", "optimizer", "loss", "densify", "output", "iterations", "seed"}
 """Keys of every ``config.yml`` that a fit has written."""
 
-DATA_PATHS = ("data.path", "init.point_cloud")  # also recorded relative to the folder
+DATA_PATHS = ("data.path", "data.depth_from", "init.point_cloud")
+"""Also recorded relative to the folder."""
 
 
 def claim_output_folder(folder: Path, config: FitConfig, images: Sequence[str] = ()) -> None:
@@ -67,7 +69,8 @@ def check_output_folder(folder: Path, config: FitConfig, images: Sequence[str] =
             f"{format_names(present)}; choose another with --out"
         )
     record, differences = FolderRecord(folder, COMMAND), _differences_of_run(folder, config)
-    is_run, is_config_alone = record.exists or CHECKPOINT in present, present == [CONFIG]
+    is_run = record.exists or CHECKPOINT in present
+    is_config_alone = {*present} <= {CONFIG, EXAMINATION}
     if not _is_unmodified(folder / CONFIG) and (not is_run or (is_config_alone and differences)):
         raise UserError(
             f"{folder / CONFIG}: would be replaced, and was not written by a fit, or changed "
@@ -136,6 +139,11 @@ def require_no_run(folder: Path) -> None:
 def has_results(folder: Path) -> bool:
     """Return whether the run in ``folder`` is complete."""
     return (folder / METRICS).is_file()
+
+
+def is_run_of(folder: Path, config: FitConfig) -> bool:
+    """Return whether ``folder`` contains a run of this configuration, complete or not."""
+    return (folder / CONFIG).is_file() and not _differences_of_run(folder, config)
 
 
 def is_finished(folder: Path, config: FitConfig) -> bool:
@@ -286,7 +294,8 @@ def _is_unmodified(path: Path) -> bool:
 
 
 def _data_paths(config: FitConfig) -> dict[str, Path | None]:
-    return {"data.path": config.data.path, "init.point_cloud": config.init.point_cloud}
+    values = (config.data.path, config.data.depth_from, config.init.point_cloud)
+    return dict(zip(DATA_PATHS, values, strict=True))
 
 
 def _differences_of_run(folder: Path, config: FitConfig) -> str:
@@ -301,7 +310,7 @@ def _differences_of_run(folder: Path, config: FitConfig) -> str:
     except UserError:
         return f"with a {CONFIG} that is not readable"
     theirs, ours = (
-        each.model_dump(mode="json", exclude={"output"})
+        each.model_dump(mode="json", exclude={"output": True, "data": {"in_memory"}})
         for each in (with_decisions(run, config), with_decisions(config, run))
     )
     differences = _differences(theirs, ours)

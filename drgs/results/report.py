@@ -7,7 +7,7 @@ import html
 import io
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -43,6 +43,7 @@ from drgs.results.files import (
 )
 from drgs.results.history import FitHistory, summarize_density
 from drgs.results.metrics import FitMetrics, map_ahead, psnr, ssim
+from drgs.results.ranking import RankedPhotograph, Render, rank_photographs
 from drgs.results.viewer import DisplaySettings, seconds_of_page, write_viewer
 
 MAX_PICTURES = 25
@@ -60,9 +61,6 @@ PANEL_ENCODING = {"lossless": True, "quality": 60, "method": 2}
 
 MIN_TRIAL_SECONDS = 0.2  # for averaging renders of a few milliseconds
 FILES_SECONDS = 0.3  # time of the other files, measured with 50,000 Gaussians
-
-Render = Callable[[tuple[View, ...]], Iterable[np.ndarray]]
-"""Yields images (H, W, 3) of views as fitted, display space."""
 
 
 class Score(NamedTuple):
@@ -156,6 +154,7 @@ def seconds_of_results(
         report=seconds_of_page(num_gaussians, sh_degree)
         + pictures * compared
         + len(choose_views(range(views))) * (rendered + 3 * encoded)
+        + len(dataset.train) * rendered  # to be ranked
         + ORBIT_FRAMES * (2 * rendered + encoded),
     )
 
@@ -227,6 +226,7 @@ def write_report(
     scores: of the test views, in order; orbit: the bytes of an animated WebP.
     """
     chosen, has_viewer = choose_views([s.psnr for s in scores]), path.with_name(VIEWER).is_file()
+    ranked = rank_photographs(dataset.train, render, dataset.background)
     template = resources.files("drgs.results").joinpath("page.html").read_text("utf-8")
     page = Template(template).substitute(
         title=html.escape(title),
@@ -250,6 +250,8 @@ def write_report(
             _row(view.name, f"{score.psnr:.2f}")
             for view, score in zip(dataset.test, scores, strict=True)
         ),
+        worst="".join(_photograph_figure(each) for each in ranked if each.images is not None),
+        training_views="".join(_row(each.name, f"{each.psnr:.2f}") for each in ranked),
         config=html.escape(yaml.safe_dump(metrics["config"], sort_keys=False)),
     )
     with atomic_path(path) as temporary:
@@ -328,6 +330,17 @@ def _comparison(dataset: Dataset, render: Render, label: str, index: int, score:
     psnr = f"{score.psnr:.2f} dB" if math.isfinite(score.psnr) else "infinite"
     caption = f"<b>{label}: {html.escape(view.name)}</b> PSNR {psnr}, SSIM {score.ssim:.4f}"
     return f'<figure><figcaption>{caption}</figcaption><div class="three">{renders}</div></figure>'
+
+
+def _photograph_figure(photograph: RankedPhotograph) -> str:
+    assert photograph.images is not None, "the worst have images"
+    name, hint = html.escape(photograph.name), html.escape(photograph.hint)
+    source = _data_uri(np.clip(photograph.images, 0, 1), **PANEL_ENCODING)
+    caption = f"<b>{name}</b> PSNR {photograph.psnr:.2f} dB{': ' if hint else ''}{hint}"
+    return (
+        f'<figure><img alt="{name}, photograph and rendering" src="{source}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
 
 
 def _truth(dataset: Dataset) -> str:

@@ -22,6 +22,7 @@ import drjit as dr
 from typing_extensions import override
 
 from drgs.cameras.camera import Camera
+from drgs.cameras.lens import shortest
 from drgs.config.approximations import FALLOFFS
 from drgs.core.arrays import is_float64, reinterpret, types_of
 from drgs.core.constants import WHITENING_SCALE
@@ -445,6 +446,7 @@ class FootprintModel:
     positions: SamplePositions = field(default_factory=PixelCenters)
     features: SplatFeatures = field(default_factory=SplatFeatures)
     cutoffs: Cutoffs = field(default_factory=Cutoffs)
+    period: Float | None = None  # px: after it, along x, a splat is seen again; None: never
 
     def for_camera(self, camera: Camera) -> FootprintModel:
         """Return this model for one camera."""
@@ -452,6 +454,7 @@ class FootprintModel:
             self,
             falloff=self.falloff.for_camera(camera),
             features=self.features.for_camera(camera),
+            period=camera.lens.period(camera),
         )
 
     def check_differentiable_in_camera(self) -> None:
@@ -466,11 +469,21 @@ class FootprintModel:
             positions=positions,
             features=self.features.bind(lanes, positions),
             cutoffs=self.cutoffs,
+            period=self.period,
         )
 
     def footprint(self, geometry: list[Float], lanes: Lanes, active: Bool | bool) -> Footprint:
         """Evaluate a splat at the pixels of each lane."""
-        return self.falloff.footprint(geometry, partial(self.positions.offsets, lanes), active)
+        return self.falloff.footprint(geometry, partial(self._offsets, lanes), active)
+
+    def nearest(self, x: Float, mean_x: Float) -> Float:
+        """Return where a point at x, px, is seen next to a mean at ``mean_x``."""
+        return x if self.period is None else mean_x + shortest(x - mean_x, self.period)
+
+    def _offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
+        """Return grids of x and y, px, from a mean to the pixels; with a period, the nearest."""
+        dx, dy = self.positions.offsets(lanes, x, y)
+        return [[shortest(each, self.period) for each in row] for row in dx], dy
 
     def alphas(self, geometry: list[Float], footprint: Footprint) -> Iterator[Alpha]:
         """Yield alpha at the 16 pixels.

@@ -414,24 +414,24 @@ def _back_to_rows(
         return d_rows, dr.detach(splats.visible), [dr.grad(number) for number in numbers]
 
 
-def weighted_sums(frame: Frame, plane: Float) -> Float:
-    """Return, for each Gaussian, the sum over pixels of its weight times ``plane``: (N,).
+def weighted_sums(frame: Frame, *planes: Float) -> list[Float]:
+    """Return, for each Gaussian, sums over pixels of its weight times each plane: (N,) each.
 
-    plane: x, Float (H * W,), the same for all samples. A plane of the frame is C = sum_i w_i c_i,
-    so the adjoint's derivative with respect to c_i is sum w_i g over pixels: here g is x for the
-    first feature and 0 for the rest. This reuses the adjoint's kernel, unless colours are evaluated
-    along each pixel's ray.
+    planes: x, Float (H * W,), the same for all samples; at most as many as the frame has features.
+    A plane of the frame is C = sum_i w_i c_i, so the adjoint's derivative with respect to c_i is
+    sum w_i g over pixels: here g is x for the first features and 0 for the rest. This reuses the
+    adjoint's kernel, unless colours are evaluated along each pixel's ray.
     """
     model, samples = frame.bins.model, frame.bins.grid.samples
     bins = replace(
         frame.bins, model=replace(model, features=model.features.with_weight_derivatives())
     )
-    plane = repeat_array(plane, samples)
-    zeros = dr.opaque(type(plane), 0, dr.width(plane))
-    d_features = [plane, *[zeros] * (frame.layers.count - 1)]
+    repeated = [repeat_array(plane, samples) for plane in planes]
+    zeros = dr.opaque(type(repeated[0]), 0, dr.width(repeated[0]))
+    d_features = [*repeated, *[zeros] * (frame.layers.count - len(planes))]
     inputs = frame.records, frame.layers, d_features, zeros
     gradients = frame.order.adjoint(bins, *inputs, range(samples))
-    return gradients.features[0]
+    return gradients.features[: len(planes)]
 
 
 def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
+from drgs.cameras.lens import shortest
 from drgs.core.arrays import Rows, interleave, types_of
 from drgs.core.errors import UserError
 from drgs.core.private import bucket_order
@@ -189,16 +190,42 @@ def _tile_box(
     # still in floating point: a splat may be arbitrarily far away.
     first = dr.ceil(center - radius - 0.5)
     last = dr.floor(center + radius - 0.5)
+    # Columns of tiles go on behind the last one, if the film is a whole turn.
+    more: Float | float = 0
+    if model.period is not None:
+        first.x, last.x, more = _wrap_columns(first.x, last.x, model.period, grid)
     first = dr.select(first < 0, 0, first)
     last = dr.select(last > size - 1, size - 1, last)
-    visible = splats.visible & (first.x <= last.x) & (first.y <= last.y)
+    visible = splats.visible & ((first.x <= last.x) | (more > 0)) & (first.y <= last.y)
 
     Pixel = dr.uint32_array_t(type(first))
     first_tile = Pixel(dr.select(visible, first, 0)) // TILE
     last_tile = Pixel(dr.select(visible, last, 0)) // TILE
     extent = last_tile - first_tile + 1
+    if model.period is not None:
+        extent.x = dr.minimum(extent.x + t.UInt32(more), dr.opaque(t.UInt32, grid.columns))
     count = dr.select(visible, extent.x * extent.y, 0)
     return [t.Float(number) for number in (*first_tile, extent.x, count)]
+
+
+def _wrap_columns(
+    first: Float, last: Float, period: Float, grid: TileGrid
+) -> tuple[Float, Float, Float]:
+    """Return the first and the last pixel column of a splat on a film that is a whole turn.
+
+    And the columns of tiles to add to those between the two, if the last is left of the first: all.
+    """
+    width = dr.opaque(type(first), grid.width)
+    length = last - first
+    first = dr.fma(-period, dr.floor(first / period), first)
+    last = first + length
+    hidden = first >= width  # it begins beside a crop window
+    first, last = dr.select(hidden, 0, first), dr.select(hidden, last - period, last)
+    crosses = last >= period
+    last = dr.select(crosses, last - period, last)
+    everywhere = ~(length < period)
+    first, last = dr.select(everywhere, 0, first), dr.select(everywhere, width, last)
+    return first, last, dr.select(crosses & ~everywhere, type(first)(grid.columns), 0)
 
 
 def _make_entries(
@@ -229,6 +256,9 @@ def _make_entries(
     # has no vector instruction.
     row = t.UInt32((t.Float(local) + 0.5) / t.Float(columns))
     tile_x = tile_x + (local - row * columns)
+    if model.period is not None:
+        columns = dr.opaque(t.UInt32, grid.columns)
+        tile_x = dr.select(tile_x >= columns, tile_x - columns, tile_x)
     tile_y = tile_y + row
     tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
     geometry = rows.load(rank)[: model.falloff.num_geometry]
@@ -283,17 +313,21 @@ def _touched_micros(
     dx_per_dy = -r / p
     dy_per_dx = -(p * r) / dr.fma(r, r, s * s)
 
-    def intervals(tile: UInt32, mean: Float) -> list[tuple[Float, Float]]:
+    size = MICRO - 1 + 2 * margin
+
+    def intervals(tile: UInt32, mean: Float, period: Float | None) -> list[tuple[Float, Float]]:
         first = dr.fma(t.Float(tile), TILE, 0.5 - margin) - mean
-        size = MICRO - 1 + 2 * margin
-        return [(first + MICRO * k, first + (MICRO * k + size)) for k in range(GRID)]
+        if period is None:
+            return [(first + MICRO * k, first + (MICRO * k + size)) for k in range(GRID)]
+        middles = [shortest(first + (MICRO * k + size / 2), period) for k in range(GRID)]
+        return [(middle - size / 2, middle + size / 2) for middle in middles]
 
     def exponent(dx: Float, dy: Float) -> Float:
         u = dr.fma(p, dx, r * dy)
         v = s * dy
         return dr.fma(u, u, v * v)
 
-    columns, rows = intervals(tile_x, mean_x), intervals(tile_y, mean_y)
+    columns, rows = intervals(tile_x, mean_x, model.period), intervals(tile_y, mean_y, None)
     nearest_dx = [_clamp(t.Float(0), lo, hi) for lo, hi in columns]
     nearest_dy = [_clamp(t.Float(0), lo, hi) for lo, hi in rows]
     mask = t.UInt32(0)
@@ -302,6 +336,8 @@ def _touched_micros(
             facing_x = exponent(dx, _clamp(dy_per_dx * dx, *y_range))
             facing_y = exponent(_clamp(dx_per_dy * dy, *x_range), dy)
             touched = (facing_x <= reach) | (facing_y <= reach)
+            if model.period is not None:  # pixels on both sides of the point opposite of the mean
+                touched |= dr.maximum(dr.abs(x_range[0]), dr.abs(x_range[1])) > model.period / 2
             mask |= dr.select(touched, t.UInt32(1 << (j * GRID + i)), 0)
     return mask
 

@@ -25,8 +25,9 @@ from drgs.results.folder import load_run_config, write_run_config
 from drgs.results.history import DENSITY_COLUMNS, HistoryRow
 from drgs.training.trainer import DENSITY
 
-PATH_KEYS = ("data.path", "data.source", "init.point_cloud")
-"""Values that differ in a project that was moved; the data has a fingerprint."""
+PLACE_KEYS = ("data.path", "data.source", "data.in_memory", "data.depth_from", "init.point_cloud")
+"""Values that differ in a project that was moved, or on another machine; the data has a
+fingerprint."""
 
 MEANS_ARRAY = "means.value"  # the array that has a row for each Gaussian
 
@@ -171,7 +172,7 @@ def _as_text(config: FitConfig) -> str:
 def _match_leaves(config: FitConfig, values: Mapping[str, object]) -> FitConfig:
     """Return a checkpoint's configuration, with places and the section ``output`` of another."""
     places = {}
-    for key in PATH_KEYS:
+    for key in PLACE_KEYS:
         section, name = key.split(".")
         places[key] = getattr(getattr(config, section), name)
     output = config.output.model_dump()

@@ -15,8 +15,10 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.config.approximations import Approximations
+from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.core.environment import processor
+from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
 from drgs.core.folders import sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
@@ -28,6 +30,7 @@ from drgs.results.refined_cameras import write_views
 from drgs.results.report import MAX_PICTURES, FitImages, write_images, write_results
 from drgs.results.viewer import DisplaySettings, shows_as_fitted
 from drgs.training.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
+from drgs.training.examination import Examination, given_keys
 from drgs.training.loop import History
 from drgs.training.parallel.inputs import versions
 from drgs.training.trainer import Trainer
@@ -87,6 +90,29 @@ class FitFolder:
         """Write the plan and its reasons."""
         with atomic_path(self.path / files.BUDGET_PLAN) as temporary:
             temporary.write_text(text)
+
+    def write_examination(self, examination: Examination) -> None:
+        """Write what was chosen, and why."""
+        with atomic_path(self.path / files.EXAMINATION) as temporary:
+            temporary.write_text(examination.to_json())
+
+    def with_examination(self, config: FitConfig) -> FitConfig | None:
+        """Return the configuration with what an examination chose for the run in the folder.
+
+        None: there is no such run. Given values stay.
+        """
+        path = self.path / files.EXAMINATION
+        if self.overwrites or not path.is_file():
+            return None
+        try:
+            changes, given = dict(json.loads(path.read_text())["changes"]), given_keys(config)
+            changed = with_changes(config, {k: changes[k] for k in changes.keys() - given})
+        except (ValueError, KeyError, TypeError):
+            raise UserError(
+                f"{path}: must be what an examination wrote, got something else; examine again "
+                "with --overwrite, or choose another folder with --out"
+            ) from None
+        return changed if folder.is_run_of(self.path, changed) else None
 
     @property
     def remedy(self) -> str:

@@ -18,7 +18,9 @@ from drgs.config.schema import FitConfig
 from drgs.core.constants import ALPHA_CUT, LOW_PASS, TRANSMITTANCE_STOP
 from drgs.core.errors import UserError
 from drgs.core.memory import available_memory, format_bytes, resident_memory
+from drgs.datasets.film import to_camera, to_film
 from drgs.datasets.images import shift_pixels
+from drgs.datasets.storage import is_on_disk
 from drgs.datasets.types import Dataset, View, Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
@@ -49,6 +51,10 @@ FITTED_SLOTS = 2.7  # slots of an entry of fitted Gaussians: 2.0 to 3.7 in the s
 COUNTED_VIEWS, COUNTED_GAUSSIANS = 8, 20_000  # estimates entries and slots to a few per cent
 
 MAX_RADIUS_PX = 1e6  # A larger radius covers any film
+
+AHEAD_BYTES = 120
+"""Memory of each pixel of a view whose photograph is on disk: 12 of the iteration's and of each of
+the two that are read ahead, and those of a photograph that is halved."""
 
 USABLE_SHARE = 0.9  # share of the available memory that is used: estimates are about so exact
 
@@ -103,11 +109,12 @@ def estimate(
     fitted = count * (1 + FITTED_REACH * math.sqrt(pixels / count)) ** 2
     entries, slots = _bytes_at_start(train, gaussians, config.model.near_plane, scale)
     entries, slots = max(entries, fitted), max(slots, FITTED_SLOTS * fitted)
+    ahead = AHEAD_BYTES * pixels if any(map(is_on_disk, train)) else 0
     numbers = 11 + 3 * (config.model.sh_degree + 1) ** 2
     of_gaussian = NUMBER_BYTES * numbers + GAUSSIAN_BYTES + (GROWTH_BYTES if count > start else 0)
     return FitMemory(
         process=PROCESS_BYTES,
-        photographs=round(sum(_photograph_bytes(view, scale) for view in views)),
+        photographs=round(ahead + sum(_photograph_bytes(view, scale) for view in views)),
         targets=round(scale**2 * pixel_bytes * sum(_target_pixels(view) for view in train)),
         gaussians=round(of_gaussian * count / processes),
         splats=round(ENTRY_BYTES * entries * times + SLOT_BYTES * min(slots, BAND_SLOTS)),
@@ -144,14 +151,13 @@ def _bytes_at_start(
     reach = np.sqrt(2 * np.log(opacities / ALPHA_CUT))
     counts = []
     for view in views[:: -(-len(views) // COUNTED_VIEWS)]:
-        x, y, z = ((means - view.center) @ view.camera_to_world[:3, :3]).T
+        u, v, z = to_film(view, to_camera(view, list(means.T)))
         seen = z > near
         z = np.where(seen, z, 1)
         focal, size = scale * math.sqrt(view.fx * view.fy), np.array([view.width, view.height])
         radius = np.minimum(reach * np.sqrt((focal * scales / z) ** 2 + LOW_PASS), MAX_RADIUS_PX)
         tiles, boxes = seen.astype(np.float64), np.ones(len(z))
-        centers = scale * (view.fx * x / z + view.cx), scale * (view.fy * y / z + view.cy)
-        for center, length in zip(centers, scale * size, strict=True):
+        for center, length in zip((scale * u, scale * v), scale * size, strict=True):
             inside = np.minimum(center + radius, length) - np.maximum(center - radius, 0)
             tiles *= np.where(inside > 0, np.maximum(inside, 0) / TILE + 1, 0)
             boxes *= np.maximum(inside, 0) / (2 * radius)
@@ -175,12 +181,16 @@ def room_for_targets(
 ) -> int:
     """Return the bytes of targets that may stay on the device; pixel_bytes: see :func:`estimate`.
 
+    None do where photographs are on disk: what is read ahead costs no time.
+
     Raises :class:`UserError` where the fit would not fit into memory.
     """
     memory = estimate(config, dataset, gaussians, pixel_bytes, processes=comm.size)
     usable = round(USABLE_SHARE * (available_memory() / comm.num_on_machine + resident_memory()))
     if memory.required_bytes > usable:
         raise UserError(_refusal(config, dataset, gaussians, memory, usable, comm.size))
+    if any(map(is_on_disk, dataset.train)):
+        return 0
     left = usable - round(1.15 * memory.required_bytes)  # an estimate may be wrong
     return max(0, min(MAX_TARGET_BYTES, memory.targets, left))
 
@@ -204,7 +214,8 @@ def _refusal(
 
     most = next(filter(fits, _smaller(count, start)), None)
     size = next((s for s in _smaller(width, MIN_WIDTH_PX) if fits(count, s / width)), None)
-    remedies = [f"densify.max_gaussians={most}"] if most else []
+    remedies = ["data.in_memory=false"] if _fits_from_disk(dataset, memory, usable) else []
+    remedies += [f"densify.max_gaussians={most}"] if most else []
     remedies += [f"data.image_size={size}"] if size else []
     advice = f"set {' or '.join(remedies)}" if remedies else "use fewer views and Gaussians"
     who, part = "the fit", ""
@@ -217,6 +228,13 @@ def _refusal(
         f"{format_bytes(memory.splats + memory.pixels)} for an image of them), and may take "
         f"{format_bytes(usable)}, nine tenths of the available memory; {advice}"
     )
+
+
+def _fits_from_disk(dataset: Dataset, memory: FitMemory, usable: int) -> bool:
+    """Return whether a fit with photographs in memory would fit without these."""
+    ahead = AHEAD_BYTES * max(view.width * view.height for view in dataset.train)
+    can_move = all(view.files for view in dataset.train) and not any(map(is_on_disk, dataset.train))
+    return can_move and memory.required_bytes - memory.photographs + ahead <= usable
 
 
 def _smaller(number: int, least: int) -> Iterator[int]:

@@ -20,6 +20,7 @@ from typing_extensions import override
 from drgs.cli.ending import StopRequest
 from drgs.cli.execution import select_variant
 from drgs.cli.progress import RunProgress
+from drgs.config.changes import with_changes
 from drgs.config.load import config_from, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
@@ -39,6 +40,7 @@ from drgs.training.budget import Budget, Deadline, Plan, plan_fit, rehearse
 from drgs.training.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.training.density.strategy import DensityStrategy
 from drgs.training.effects.base import TrainingEffect
+from drgs.training.examination import Examination, examine, show_progress
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.fit_folder import FitFolder, saved_gaussians
 from drgs.training.loop import (
@@ -98,6 +100,8 @@ class FitSession:
     strategy: DensityStrategy | None = None  # None: the configured one
     effects: Sequence[TrainingEffect] = ()  # besides the configured ones
     loss: Loss | None = None  # None: the configured one
+    examines: bool = False  # whether an examination of the dataset chooses effects
+    examination: Examination | None = field(init=False, default=None)
     trainer: Trainer = field(init=False)
     history: History = field(init=False)
     criterion: StopCriterion = field(init=False, default_factory=StopCriterion)
@@ -126,6 +130,8 @@ class FitSession:
             plan = self.prepare()
             if folder is not None:
                 folder.claim(*self._inputs)
+                if self.examination is not None:
+                    folder.write_examination(self.examination)
             if plan is not None:
                 self.criterion = Deadline(self.trainer, plan.end, plan.chosen.curve)
                 if folder is not None and self.budget is not None:
@@ -155,11 +161,14 @@ class FitSession:
         Raises ``UserError`` for input that cannot be used. Nothing is written.
         """
         comm, checkpoint, gaussians, plan = self.comm, None, None, None
+        given = self.config
         if comm.is_root:
             checkpoint = self._load()
         if self.variant is not None or mi.variant() is None:
             select_variant(self.variant or VARIANTS[0])
         if comm.is_root:
+            if self.examines and given is not None and checkpoint is None:
+                self._examine(given)
             gaussians = self._initial_gaussians()
         gaussians = share_gaussians(comm, gaussians)
         if self.budget is not None:
@@ -189,6 +198,19 @@ class FitSession:
         self.config = resolve_defaults(config, self.dataset)
         return checkpoint
 
+    def _examine(self, given: FitConfig) -> None:
+        """Choose the effects that the photographs call for; given: not completed."""
+        _, dataset = self._inputs
+        with show_progress() if self.uses_terminal else nullcontext() as progress:
+            self.examination = examine(dataset, given, progress)
+        self._print(str(self.examination))
+        changes = self.examination.changes
+        if changes:
+            given = with_changes(given, changes)
+        if "data.background" in changes:
+            self.dataset = load_dataset(given.data_for_training, sections=given.extensions)
+        self.config = resolve_defaults(given, self._inputs[1])
+
     def _plan(self, gaussians: Gaussians, budget: Budget) -> Plan | None:
         """Plan the fit, and make the plan its configuration; None on other ranks than 0."""
         start = self.config, self.dataset, gaussians, self.comm
@@ -215,7 +237,8 @@ class FitSession:
         )
         start = start_of(config, dataset)
         self._print(description_of_start(config, start))
-        self._print(format_effects(summary_of_fit(config, dataset)))
+        reasons = {} if self.examination is None else self.examination.reasons
+        self._print(format_effects(summary_of_fit(config, dataset, reasons)))
         views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
         check_lenses(config.model, views, f"{config.data.path}: ", remedy)
         return gaussians_at(start, config)
@@ -317,10 +340,10 @@ def train(
     """Fit Gaussians to photographs, in memory: the bytes that ``drgs fit`` writes to its PLY file.
 
     config: the path of a YAML file, or of a dataset's folder (``drgs.datasets.folders`` chooses the
-    configuration); nested mappings, or a :class:`drgs.config.schema.FitConfig`. dataset: the
-    photographs and their background, by default those of the section ``data``. callback: called
-    after each iteration with its :class:`drgs.training.trainer.StepReport`; the fit ends early
-    where it returns True.
+    configuration, and :func:`drgs.examine` the effects if the folder is all that is given); nested
+    mappings, or a :class:`drgs.config.schema.FitConfig`. dataset: the photographs and their
+    background, by default those of the section ``data``. callback: called after each iteration with
+    its :class:`drgs.training.trainer.StepReport`; the fit ends early where it returns True.
 
     strategy: changes the population, instead of ``densify.strategy``; effects: take part in the fit
     besides those of the configuration; loss: of an image and its photograph, instead of ``loss``.
@@ -330,12 +353,16 @@ def train(
     Raises ``drgs.core.errors.UserError`` (a ValueError) for wrong input, naming the key and the
     remedy, and ``drgs.training.finite_checks.NonFiniteError`` if a number is not finite.
     """
+    is_folder = False
     if isinstance(config, (str, Path)):
         is_folder = Path(config).is_dir()
         config = config_for(Path(config))[0] if is_folder else load_config(config)
     elif not isinstance(config, FitConfig):
         config = config_from(config, "train(): config")
-    session = FitSession(config, dataset, strategy=strategy, effects=effects, loss=loss)
+    is_examined = is_folder and dataset is None and not (strategy or effects or loss)
+    session = FitSession(
+        config, dataset, strategy=strategy, effects=effects, loss=loss, examines=is_examined
+    )
     with reporting_extensions():
         session.prepare()
         trainer, history = session.trainer, session.history

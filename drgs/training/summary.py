@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 from drgs.config.extensions import EFFECTS, LOSS_TERMS, LOSSES, STRATEGIES, extensions_in_use
 from drgs.config.schema import FitConfig
@@ -18,12 +19,17 @@ from drgs.integrator.summary import (
 )
 
 
-def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
-    """Return the effects of a fit, in the order in which they are listed."""
+def summary_of_fit(
+    config: FitConfig, dataset: Dataset, reasons: Mapping[str, str] = MappingProxyType({})
+) -> list[SimulatedEffect]:
+    """Return the effects of a fit, in the order in which they are listed.
+
+    reasons: evidence by which values were chosen, by key: see :mod:`drgs.training.examination`.
+    """
     views, model, ignored = dataset.train, config.model, dataset.ignored
     depths = _of_data("depth", [v.depth for v in views], "supervision", "the dataset's depth")
     depths = depths.unless_ignored(config.loss.depth_weight == 0)
-    return [
+    effects = [
         view_dependence_effect(model.sh_degree, f"model.sh_degree: {model.sh_degree}"),
         SimulatedEffect("background", "a random colour at each iteration", "data.random_background")
         if config.data.random_background
@@ -40,6 +46,7 @@ def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]
             None if config.colors.lr is None else "a colour transform for each training photograph",
             "colors.lr",
         ),
+        *_photometry(config),
         replace(
             _of_data("masks", [v.mask for v in views], "pixels left out", "the dataset's masks"),
             ignored="masks" in ignored,
@@ -52,6 +59,16 @@ def summary_of_fit(config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]
         ),
         *_extensions(config),
     ]
+    return [
+        replace(each, why=f"{each.why}: {reasons[each.why]}") if each.why in reasons else each
+        for each in effects
+    ]
+
+
+def _photometry(config: FitConfig) -> list[SimulatedEffect]:
+    rates = {"vignetting": config.colors.vignetting_lr, "response": config.colors.response_lr}
+    keys = {name: f"colors.{name}_lr" for name, rate in rates.items() if rate is not None}
+    return [SimulatedEffect(name, "of each camera", key) for name, key in keys.items()]
 
 
 def _extensions(config: FitConfig) -> list[SimulatedEffect]:

@@ -52,6 +52,7 @@ from drgs.training.optimizer import (
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.population import check_shardable, local_gaussians, make_population
 from drgs.training.rates import rates_over_time, revised_plan
+from drgs.training.read_ahead import ReadAhead
 from drgs.training.steps import (
     Step,
     StepView,
@@ -140,6 +141,7 @@ class Trainer:
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)
         self.stages = make_stages(dataset.train, config, self.effects, room)
+        self.read_ahead = ReadAhead(dataset.train, views_per_step, comm)
         self.gradients: WholeGradients | ViewExchange = WholeGradients(self.integrator)
         if views_per_step > 1:
             from drgs.training.parallel.exchange import ViewExchange
@@ -174,6 +176,7 @@ class Trainer:
 
     def _differentiate(self, step: Step, view: StepView) -> ViewLoss:
         """Render a view, and add the derivatives of its loss to the step's."""
+        self.read_ahead(self._coming_views(step, view.iteration))
         fit = self.fit_state(step, view.iteration)
         for effect in self.effects:
             effect.before_render(fit, view.view)
@@ -184,6 +187,14 @@ class Trainer:
         weights = self._pixel_weights(view.iteration)
         self.gradients.end_view({name: weigh(image, photograph) for name, weigh in weights.items()})
         return ViewLoss(dr.detach(loss), error, view.view.counted_share)
+
+    def _coming_views(self, step: Step, iteration: int) -> Iterator[TrainingView]:
+        """Yield the views of the fit from an iteration of ``step`` on."""
+        while True:
+            yield from (each.view for each in step.views if each.iteration >= iteration)
+            if step.last_iteration >= self.config.iterations:
+                break
+            step = self.plan(step.last_iteration + 1)
 
     def _begin_step(self) -> Step:
         """Plan the next step, and bring the scene to where the optimizer is."""

@@ -128,8 +128,9 @@ def tuning(config: FitConfig) -> FitConfig:
         "optimizer": {**RATES, "decay_from": before / total, "views_per_step": views_per_step},
         **{f"cameras.{name}_lr": 0.0 for name in ("rotation", "translation", "focal", "principal")},
     }
-    if config.colors.lr is not None:
-        changes["colors.lr"] = NEGLIGIBLE_RATE
+    for name in ("lr", "vignetting_lr", "response_lr"):
+        if getattr(config.colors, name) is not None:
+            changes[f"colors.{name}"] = NEGLIGIBLE_RATE
     return with_changes(config, changes)
 
 

@@ -25,7 +25,7 @@ from drgs.datasets import Dataset, load_dataset
 from drgs.export import load_source
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.io.formats import readable_formats
+from drgs.io.formats import writable_formats
 from drgs.results import metrics
 from drgs.results.files import CONFIG
 
@@ -65,7 +65,7 @@ def main() -> None:
     before = render(gaussians)
     quality, rows = mean_psnr(before, dataset), []
     ply_bytes = len(gaussians.to_bytes("ply"))
-    for each in readable_formats():
+    for each in writable_formats():
         read, size, writing, reading = round_trip(gaussians, each)
         after = render(read)
         psnr = mean_psnr(after, dataset)

@@ -123,7 +123,7 @@ def test_pixel_order_equals_center_order_for_separate_layers(name):
     points = points_at(case.lens, camera, film, np.linspace(1, 8, 12))
     points = points[~np.isnan(points).any(axis=1)]
     gaussians = gaussians_at_points(
-        case, rng, camera, points, np.full((len(points), 3), 1.5), np.full(len(points), 0.5)
+        case, rng, camera, points, np.full((len(points), 3), 0.9), np.full(len(points), 0.5)
     )
     gaussians = replace(gaussians, log_scales=gaussians.log_scales - 0.5)
     device = device_gaussians(gaussians, FLOAT64)

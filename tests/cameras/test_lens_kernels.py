@@ -79,7 +79,7 @@ def limit_of(lens) -> float:
 @pytest.mark.parametrize(
     ("lens", "is_limited_by_tilt"),
     [
-        *((lens, None) for lens in LENSES.values() if not isinstance(lens, effects.Orthographic)),
+        *((lens, None) for lens in LENSES.values() if isinstance(lens, (OpenCV, effects.Fisheye))),
         (OpenCV(p1=0.125, p2=-0.0625), True),
         # Limited by the radial factor's derivative along the slope, then by the factor across it.
         (OpenCV(k1=-0.25, k2=0.03125, k4=0.0625, p1=-0.03125, p2=0.015625), True),

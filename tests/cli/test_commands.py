@@ -226,8 +226,14 @@ def test_modules_run_as_commands(module, file, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("fot", "only fit, poses, render, export, view, capture and bench; did you mean fit?"),
-        ("xyz", "no command xyz, only fit, poses, render, export, view, capture and bench; see"),
+        (
+            "fot",
+            "only fit, examine, poses, render, export, view, capture and bench; did you mean fit?",
+        ),
+        (
+            "xyz",
+            "no command xyz, only fit, examine, poses, render, export, view, capture and bench;",
+        ),
         ("bench sped", "; did you mean speed?"),
         ("", "the following arguments are required: COMMAND"),
         ("bench", "the following arguments are required: MEASUREMENT"),

@@ -95,7 +95,7 @@ WRONG_INPUTS = {
     f"{NOT_READ}1000000000000 pixels)": edit(IMAGE, lambda png: declare_size(png, 10**6)),
     NOT_READ: edit(IMAGE, lambda png: declare_size(png, 2**31 - 1)),
     MODE: save_image("CMYK", (32, 24)),
-    "of view r_1 (opencv: k1), got exact; or set data.ign": exact_projection_with_distortion,
+    "of view r_1, opencv (k1), got exact; or set data.ign": exact_projection_with_distortion,
     "not a PLY of points: properties z are": edit(
         POINTS, lambda ply: ply.replace(b" z\n", b" v\n")
     ),

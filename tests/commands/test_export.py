@@ -4,6 +4,7 @@ import base64
 import gzip
 import json
 import sys
+import zipfile
 from dataclasses import replace
 
 import mitsuba as mi
@@ -12,10 +13,12 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 from support.commands import assert_ends_well, assert_refused
+from support.folders import contents
 from support.formats import (
     FLOAT32,
     PRECISION,
     assert_within,
+    each_of,
     gaussians_within_ranges,
     matched,
     turned,
@@ -25,8 +28,11 @@ from support.small_capture import blobs, make_dataset
 
 from drgs import export, render
 from drgs.gaussians.parameters import Gaussians
-from drgs.io.formats import read_gaussians, readable_formats
+from drgs.io.formats import read_gaussians, writable_formats
+from drgs.io.ply import read_points
+from drgs.results import surface
 from drgs.results.refined_cameras import write_views
+from drgs.training import decimation
 
 FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 VIEWER_RENDERING = {"antialiased": False, "low_pass": 0.3}
@@ -61,7 +67,7 @@ def configure(folder, model, **sections):
     (folder / "config.yml").write_text(yaml.safe_dump({"data": data, "model": model, **sections}))
 
 
-@pytest.mark.parametrize("each", readable_formats(), ids=lambda each: each.name)
+@pytest.mark.parametrize("each", each_of(writable_formats()))
 def test_each_format_is_written_beside_its_source(model, each):
     out = model.with_name(f"model{each.value.suffix}")
     options = []
@@ -112,7 +118,7 @@ def test_playcanvas_export_uses_the_file_with_the_nearer_low_pass(fit, low_pass,
     assert ("made to be rendered with" in outcome.stdout) == (not is_nearer)
 
 
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".glb"])
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".glb", ".sog"])
 def test_exported_file_is_rendered_and_loaded_by_the_plugin(tmp_path, suffix):
     path, images = tmp_path / f"model{suffix}", []
     blobs().save(path)
@@ -189,6 +195,89 @@ def test_options_select_the_exported_gaussians(model):
     assert sorted(found.tolist()) == sorted(g.means[kept].tolist())
 
 
+def test_floaters_and_clusters_are_removed_in_world_coordinates(tmp_path):
+    """A ball, a smaller one and something faint."""
+    far, rng = (1000.0, 0.0, 0.0), np.random.default_rng(0)
+    means = rng.uniform(-0.15, 0.15, (291, 3)) + 0.2
+    means[200:290, 0] += 5
+    means[290, 1] += 3
+    opacities = np.append(np.full(290, 0.5), 0.05)
+    scales, quats = np.full((291, 3), 0.005), np.tile([1.0, 0, 0, 0], (291, 1))
+    g = Gaussians.from_numpy(means, quats, scales, opacities, np.zeros((291, 1, 3)))
+    replace(g, origin=far).save(tmp_path / "model.ply")
+    out = tmp_path / "out.ply"
+    for options, kept, said in (
+        (["--filter-floaters"], 290, "floaters (voxels of 0.0"),
+        (
+            ["--filter-floaters", "0.2", "--filter-cluster", "0.4,0.5"],
+            200,
+            "floaters (voxels of 0.2) 1",
+        ),
+        (["--filter-cluster", "0.4,0.5", "--seed-pos", 1005, 0, 0], 90, "cluster (voxels of 0.4)"),
+    ):
+        outcome = run(tmp_path / "model.ply", "--out", out, *options)
+        assert f"kept: {kept}; left out by {said}" in outcome.stdout
+        assert Gaussians.load(out).num_gaussians == kept
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("what", "number", "left", "views"),
+    [(".", "50%", 15, "6 views of the fit"), ("point_cloud.ply", 7, 7, "64 views around the m")],
+)
+def test_decimated_file_has_that_many_gaussians_and_the_same_bytes_again(
+    fit, monkeypatch, what, number, left, views
+):
+    monkeypatch.setattr(decimation, "ITERATIONS", 3)
+    contents = []
+    for name in ("a.ply", "b.ply"):
+        outcome = run(fit / what, "--decimate", number, "--out", fit.with_name(name))
+        assert f" to {left}, by {views}" in outcome.stdout
+        contents.append(fit.with_name(name).read_bytes())
+    assert contents[0] == contents[1]
+    assert Gaussians.load(fit.with_name("a.ply")).num_gaussians == left
+
+
+def test_unpacked_sog_is_the_archive(model):
+    packed, unpacked = model.with_name("a.sog"), model.with_name("web") / "meta.json"
+    run(model, "--out", packed)
+    run(model, "--out", unpacked)
+    with zipfile.ZipFile(packed) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    assert {n: (unpacked.parent / n).read_bytes() for n in files} == files
+    found = [path.name for path in unpacked.parent.iterdir() if path.name[0] != "."]
+    assert sorted(found) == sorted(files)
+    run(unpacked, "--format", "spz")
+    assert Gaussians.load(model.with_name("web.spz")).num_gaussians == 300
+
+
+def test_folders_of_levels_that_are_foreign_are_kept(model):
+    (model.parent / "model_levels").mkdir()
+    (model.parent / "model_levels" / "1_0").write_bytes(b"mine")
+    message = "holds 1_0/meta.json, which this command would replace and has not written"
+    assert_refused(export.main, model, "--levels", 2, folder=model.parent, message=message)
+    for name in ("0_0", "1_0"):
+        source = model.parent / "mine" / name / "meta.json"
+        run(model, "--out", source)
+    message = "holds 0_0/meta.json, 1_0/meta.json, which"
+    out = model.parent / "mine" / "lod-meta.json"
+    words = (source, "--levels", 2, "--out", out)
+    assert_refused(export.main, *words, folder=model.parent, message=message)
+
+
+@pytest.mark.slow
+def test_levels_of_detail_have_half_as_many_gaussians_each(fit, monkeypatch):
+    monkeypatch.setattr(decimation, "ITERATIONS", 3)
+    run(fit, "--levels", 3)
+    folder = fit.with_name("run_levels")
+    meta = json.loads((folder / "lod-meta.json").read_text())
+    assert meta["counts"] == [20, 10, 5] and meta["filenames"][2] == "2_0/meta.json"
+    assert Gaussians.load(folder / "2_0" / "meta.json").num_gaussians == 5
+    before = contents(folder)
+    run(fit, "--levels", 3)
+    assert contents(folder) == before
+
+
 @pytest.mark.parametrize(
     ("suffix", "up"), [(".glb", [0, 1, 0]), (".spz", [0, 1, 0]), (".compressed.ply", [0, -1, 0])]
 )
@@ -227,7 +316,7 @@ def test_up_direction_uses_refined_cameras(fit, optimise):
 
 TO_SPZ = ("model.ply", "--format", "spz")
 REFUSED = [
-    (("model.ply",), "one of ply, compressed-ply, spz, glb, splat, usd, html, got none"),
+    (("model.ply",), "one of ply, compressed-ply, spz, sog, glb, splat, usd, html, mesh, got none"),
     (("model.ply", "--format", "splt"), "got splt; did you mean splat?"),
     (("model.ply", "--out", "a.obj"), "--format: must be one of"),
     ((*TO_SPZ, "--out", "a.glb"), "name of a spz file must end in .spz"),
@@ -241,6 +330,34 @@ REFUSED = [
     ((*TO_SPZ, "--min-opacity", 2), "--min-opacity: must be between"),
     ((*TO_SPZ, "--max-size", 0), "--max-size: must be above 0, got 0"),
     ((*TO_SPZ, "--max-size", 1e-9), "nothing is left; crop and filt"),
+    ((*TO_SPZ, "--filter-floaters", 0), "SIZE must be above 0, OPACITY above 0 and below 1, MI"),
+    ((*TO_SPZ, "--filter-floaters", "0.1,1"), "MIN at least 0, got 0.1,1,0.004"),
+    ((*TO_SPZ, "--filter-floaters", "0.1,0.5,-1"), "MIN at least 0, got 0.1,0.5,-1"),
+    ((*TO_SPZ, "--filter-cluster", "1,0.5,0,4"), "must be at most SIZE,OPACITY,MIN, got 1,0.5,0,4"),
+    ((*TO_SPZ, "--filter-cluster", "1,some"), "must be a finite number, got some"),
+    ((*TO_SPZ, "--filter-cluster", 1e-7), "--filter-cluster: voxels of 1e-07 are too small: the"),
+    (("--filter-cluster", *TO_SPZ), "must be a finite number, got model.ply"),
+    ((*TO_SPZ, "--filter-cluster", "0.1,0.9999999"), "nothing is left; crop and filter less"),
+    ((*TO_SPZ, "--seed-pos", 0, 0, 0), "--seed-pos: needs --filter-cluster"),
+    ((*TO_SPZ, "--filter-cluster", "--seed-pos", 1, 2), "expected 3 arguments: --seed-pos X Y Z"),
+    ((*TO_SPZ, "--decimate", 0), "--decimate: must be a whole number >= 1, got 0"),
+    ((*TO_SPZ, "--decimate", "half"), "--decimate: must be a whole number >= 1, got half"),
+    ((*TO_SPZ, "--decimate", "0%"), "must be above 0% and at most 100%, got 0%"),
+    ((*TO_SPZ, "--decimate", "101%"), "must be above 0% and at most 100%, got 101%"),
+    (("model.ply", "--levels", 1), "--levels: must be a whole number >= 2, got 1"),
+    (("model.ply", "--levels", 9), "--levels: must be at most 8, got 9"),
+    (("model.ply", "--levels", "all"), "--levels: must be a whole number >= 2, got all"),
+    ((*TO_SPZ, "--levels", 2), "--levels: writes SOG, got --format spz; leave it out"),
+    (
+        ("model.ply", "--format", "mesh", "--levels", 2),
+        "--levels: writes SOG, got --format mesh",
+    ),
+    (("model.ply", "--levels", 2, "--out", "a.sog"), "lod-meta.json, got --out a.sog"),
+    (("model.ply", "--levels", 2, "--out", "meta.json"), "lod-meta.json, got --out meta.json"),
+    (("model.ply", "--out", "lod-meta.json"), "levels of detail; give --levels N"),
+    (("model.ply", "--levels", 2, "--max-size", 1e-9), "nothing is left; crop and filt"),
+    ((*TO_SPZ, "--out", "web/meta.json"), "must end in .spz, got that of a sog file"),
+    ((*TO_SPZ, "--decimate", "ten%"), "--decimate: must be a finite number, got ten"),
 ]
 
 
@@ -294,3 +411,41 @@ def test_file_is_shown_as_a_whole_with_z_up(fit, tmp_path, name):
     assert np.corrcoef(heights, expected)[0, 1] > 0.9999  # rounded to 10 bits
     black = scene["settings"]["background"]["color"] == [0, 0, 0]
     assert black == (name != ".")
+
+
+def mesh_points(path):
+    if path.suffix == ".ply":
+        return read_points(path)[0]
+    scene = pytest.importorskip("trimesh").load(path, process=False)
+    x, y, z = np.asarray(scene.to_mesh().vertices).T
+    return np.stack([x, -z, y], axis=1)
+
+
+@pytest.mark.slow
+def test_mesh_is_where_the_gaussians_are(fit, tmp_path, monkeypatch):
+    """The fit's cameras are turned with the model; a file gets cameras of its own."""
+    pytest.importorskip("skimage", reason="the extra mesh is not installed")
+    monkeypatch.setattr(surface, "VIEWS_PER_RING", 6)
+    monkeypatch.setattr(surface, "RING_SIDE_PX", 60)
+    g, found = blobs(20), {}
+    cases = {
+        "a.ply": (fit, 6),
+        "a.glb": (fit, 6, "--up", 0, 0, 1),
+        "b.ply": (fit, 6, "--up", 0, 1, 0),
+        "c.ply": (fit / "point_cloud.ply", 24),
+    }
+    for name, (what, num_views, *options) in cases.items():
+        out = tmp_path / name
+        outcome = run(what, "--format", "mesh", "--mesh-size", 40, "--out", out, *options)
+        assert f"{num_views} views: " in outcome.stdout and "note: " not in outcome.stdout
+        found[name] = mesh_points(out)
+    found["b.ply"] = found["b.ply"] @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    for name, points in found.items():
+        offsets = points[:, None] - g.means
+        rotations = Rotation.from_quat(g.quats, scalar_first=True).as_matrix()
+        local = np.einsum("pni,nij->pnj", offsets, rotations) / g.scales
+        sigmas = np.linalg.norm(local, axis=2).min(axis=1)  # of the nearest, by Mahalanobis
+        share = (sigmas < 3).mean()
+        assert len(points) > 1000 and share > 0.9, (name, share)
+    np.testing.assert_array_equal(found["a.ply"].shape, found["a.glb"].shape)
+    np.testing.assert_allclose(found["a.ply"], found["a.glb"], atol=1e-5)

@@ -15,7 +15,13 @@ import numpy as np
 import pytest
 import yaml
 from conftest import REPOSITORY
-from support.fit_command import assert_fits, run_fit, without_images, write_project
+from support.fit_command import (
+    assert_fit_refused,
+    assert_fits,
+    run_fit,
+    without_images,
+    write_project,
+)
 from support.folders import visible
 from support.small_capture import write_dataset
 from support.small_fits import config_of, make_trainer, plain_dataset, steps, true_blobs
@@ -264,3 +270,16 @@ def test_fit_with_all_effects_writes_their_files(tmp_path, monkeypatch):
     )
     assert_fits(config, "--out", tmp_path / "out")
     assert (tmp_path / "out" / "cameras.json").is_file()
+
+
+def test_photographs_that_are_left_out_are_not_fitted(tmp_path, monkeypatch):
+    without_images(monkeypatch)
+    project, out = write_project(tmp_path), tmp_path / "out"
+    text = assert_fits(project, "--out", out, "--leave-out", "train/r_1").stdout
+    assert "1 of these left out" in text and "2 views to train on, 2 of split 'test'" in text
+    assert yaml.safe_load((out / "config.yml").read_text())["data"]["leave_out"] == ["train/r_1"]
+    message = "data.leave_out: "
+    words = (project, "--out", tmp_path / "other", "--leave-out")
+    assert_fit_refused(*words, "r_1.jpg", folder=tmp_path, message=message)
+    message = "--set, --leave-out, --budget and --overwrite"
+    assert_fit_refused("--resume", out, "--leave-out", "r_1", folder=tmp_path, message=message)

@@ -42,7 +42,9 @@ from drgs import export
 from drgs.core.errors import UserNote
 from drgs.datasets import load_dataset
 from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views
-from drgs.gaussians.parameters import Gaussians
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.reference import effects
+from drgs.reference import splatting as reference
 from drgs.results.files import VIEWS
 from drgs.results.refined_cameras import write_views
 
@@ -186,6 +188,31 @@ def test_camera_set_by_options_is_used(fit, tmp_path):
     for what, background in ((fit / "point_cloud.ply", BLACK), (fit, WHITE)):
         run(what, *words)
         assert_shows(tmp_path / "camera.png", VIEW, background)
+
+
+@pytest.mark.parametrize("way", ["origin", "orbit", "camera"])
+def test_panoramas_equal_the_reference(fit, tmp_path, way):
+    """They are level at any place and along an orbit; poses of a file are kept."""
+    pose, words, name = POSE, ["--origin", *POSE[:3, 3], "--target", *FOCUS], "camera"
+    if way == "orbit":
+        orbit = orbit_of_gaussians(blobs(), (0, 0, 1), 40)
+        pose = orbit.viewpoints(3, 60, 30, 40)[1].camera_to_world
+        words, name = ["--orbit", 3], "orbit_001"
+    if way == "camera":
+        frames = [{"transform_matrix": (POSE * [1, -1, -1, 1]).tolist()}]
+        (tmp_path / "camera.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+        words, name = ["--camera", tmp_path / "camera.json"], "camera_0"
+        axes = pose[:3, :3].T
+    else:
+        level = pose[:3, 2] * [1, 1, 0] / np.linalg.norm(pose[:2, 2])
+        axes = np.array([np.cross([0, 0, -1], level), [0, 0, -1], level])
+    out = tmp_path / "out"
+    run(fit / "point_cloud.ply", *words, "--panorama", "--size", 60, 30, "--out", out)
+    gaussians = {k: getattr(blobs(), k).astype(float) for k in PARAMETER_NAMES}
+    camera = reference.Camera(axes, pose[:3, 3], 1, 1, 0, 0, 60, 30, 0.2)
+    expected = effects.render(reference.Gaussians(**gaussians), camera, effects.Equirectangular())
+    image = np.clip(expected.image, 0, 1)
+    assert_images_agree(rendered(out / f"{name}.png"), image, expected, EIGHT_BITS)
 
 
 HEADER = {"antialiased": True, "low_pass": 0.02}

@@ -70,6 +70,10 @@ WRONG_WORDS = [
     (("", "--origin", 0, 0, "nan"), "--origin: must be a finite number, got nan"),
     (("", *CAMERA, "--fov", 180), "--fov: must be between 0 and 180"),
     (("", *CAMERA, "--size", 0, 9), "--size: must be a whole"),
+    (("", "--panorama"), "--panorama: is not used with Gaussians and --split"),
+    ((PLY, "--panorama"), "choose the cameras: --orbit N, --camera FILE.json, --origin X Y Z"),
+    (("", "--orbit", 2, "--panorama", "--fov", 40), "--fov: a panorama shows all directions, got"),
+    (("", *CAMERA, "--panorama", "--set", "model.projection=exact"), "equirectangular, got exact"),
     (("", "--background", "pink"), "or an image's file, got pink"),
     (("", "--background", 0, 0, 1.5), "got 0 0 1.5"),
     (("", "--background", SKY), "an image is not what the photographs were composited over"),
@@ -99,7 +103,7 @@ def test_exact_projection_with_distortion_is_refused(tmp_path, mode):
     words = [fit, "--set", "model.projection=exact", mode]
     words += ["test"] if mode == "--split" else [path, "--size", WIDTH, HEIGHT]
     view = "r_0" if mode == "--split" else "camera_0"
-    message = f"such as that of view {view} (opencv: k1), got exact; or give --ignore distortion"
+    message = f"such as that of view {view}, opencv (k1), got exact; or give --ignore distortion"
     refused(tmp_path, *words, message=message)
     assert_ends_well(render.main, *words, "--ignore", "distortion", "--out", tmp_path / "out")
 

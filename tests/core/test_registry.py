@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from drgs.core.registry import Registry
+from drgs.config.extensions import EFFECTS
+from drgs.core.registry import Registry, temporary_registrations
 
 
 def test_shipped_extensions_are_imported_when_used(monkeypatch, tmp_path):
@@ -36,3 +37,12 @@ def test_two_kinds_cannot_share_a_name():
     with pytest.raises(ValueError, match='a kind is called "shared_by_two" already'):
         Registry("other kind").register("shared_by_two")(object)
     first._extensions.clear()
+
+
+def test_extensions_registered_again_for_a_while_are_back_afterwards():
+    before = EFFECTS.get("depth")
+    with temporary_registrations():
+        replaced = type("Replaced", (), {"__module__": before.module})
+        EFFECTS.register("depth")(replaced)
+        assert EFFECTS.get("depth").value is replaced
+    assert EFFECTS.get("depth") is before

@@ -20,10 +20,10 @@ from support.datasets import load, load_noting, refusal, views_by_name
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.files import masks_of
+from drgs.datasets.film import to_film
 from drgs.datasets.images import is_scaled
 from drgs.datasets.transforms import LENS_OF_MODEL
 from drgs.initialization.defaults import resolve_defaults
-from drgs.initialization.film import to_film
 from drgs.initialization.start import start_of
 from drgs.io.colmap import MODELS
 
@@ -353,6 +353,13 @@ REFUSED = [
     (without("sparse"), "there is no model of COLMAP in sparse/0"),
     (lambda folder: write_images(folder / "images", ["b.jpg"], (480, 640)), "was 640 x 480 px for"),
 ]
+
+
+def test_part_of_a_panorama_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setitem(PARAMETERS, "EQUIRECTANGULAR", (1280.0, 480.0))
+    write_dataset(tmp_path, ["EQUIRECTANGULAR"])
+    message = "w and h of a panorama must be its size, 640 x 480 px, got 1280 x 480; give whole"
+    assert message in refusal(tmp_path)
 
 
 @pytest.mark.parametrize(("change", "message"), REFUSED)

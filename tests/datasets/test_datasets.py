@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.datasets import CENTERS, edit, load, load_noting, put, refusal, views_by_name
 
+from drgs.cameras.equirectangular import Equirectangular
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
@@ -168,7 +169,7 @@ def test_angles_replace_missing_focal_lengths(photographs):
     assert load(photographs).train[0].fy == pytest.approx(3 / math.tan(0.25))
 
 
-PRISM = "THIN_PRISM_FISHEYE"
+PRISM, PANORAMA = "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR"
 
 LENSES = [
     ({"k1": 0.1, "k2": 0.0, "p1": -0.02}, RadialTangential, ["k1", "p1"]),
@@ -196,6 +197,20 @@ def test_lens_is_read_and_does_not_depend_on_the_image_size(photographs, values,
     assert load(photographs, ignore_distortion=True).train[0].lens is None
 
 
+def test_panoramas_need_no_focal_length(photographs):
+    """The whole image is a turn, whatever nerfstudio writes; and no pinhole could replace it."""
+    path = photographs / "transforms.json"
+    edit(path, lambda m: m.update(camera_model=PANORAMA, fl_x=None, cx=1.0))
+    for options, width, height in (({}, 8, 6), ({"image_size": 4}, 4, 3)):
+        for ignored in (False, True):
+            dataset = load(photographs, ignore_distortion=ignored, **options)
+            view = dataset.train[0]
+            assert view.lens == Equirectangular() and (view.width, view.height) == (width, height)
+            assert (2 * np.pi * view.fx, np.pi * view.fy) == pytest.approx((width, height))
+            assert (view.cx, view.cy) == (width / 2, height / 2)
+            assert dataset.description.endswith("; lens equirectangular")
+
+
 REFUSED_INTRINSICS = [
     ({"fl_x": None}, "fl_x is missing, and there is no camera_angle_x either"),
     ({"fl_y": -1}, "fl_y must be > 0, got -1"),
@@ -206,6 +221,7 @@ REFUSED_INTRINSICS = [
     ({"w": 16}, "w must be the image's size, 8 px ({0}/images/00.png), got 16; scale the intrins"),
     ({"camera_model": "EQUI"}, "camera_model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADI"),
     ({"is_fisheye": True, "p1": 0.5}, "p1: a lens of the kind fisheye has the coefficients k1, k2"),
+    ({"k1": 0.5, "camera_model": PANORAMA}, "k1: a lens of the kind equirectangular has the coeff"),
     ({"sx1": 0.5}, "sx1: a lens of the kind opencv has the coefficients k1, k2, k3, k4, k5, k6, p"),
     ({"k4": 0.25, "camera_model": "OPENCV"}, "k4 is read as OpenCV's, of a denominator 1 + k4 r^"),
 ]

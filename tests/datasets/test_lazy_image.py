@@ -11,7 +11,7 @@ from drgs.config.schema import DataConfig
 from drgs.datasets import images, load_dataset, reader
 from drgs.datasets.images import (
     LazyImage,
-    check_memory,
+    choose_store,
     compact_photograph,
     downscale,
     without_images,
@@ -131,14 +131,15 @@ def test_photographs_larger_than_memory_are_refused_before_reading(photographs, 
     iio.imwrite(photographs / "images" / "01.png", rgba)
     files = sorted((photographs / "images").iterdir())
     monkeypatch.setattr(images, "available_memory", lambda: 1488)
-    check_memory(files, None)
+    choose_store(files, None, True)
     monkeypatch.setattr(images, "available_memory", lambda: 1487)
     monkeypatch.setattr(reader, "read_pixels", None)
-    assert refusal(photographs) == (
+    assert refusal(photographs, in_memory=True) == (
         f"{photographs / 'images'}: 10 photographs take 1.49 kB of memory as they are kept, and "
-        "1.49 kB are available; set a smaller data.image_size, or use fewer of them"
+        "1.49 kB are available; set data.in_memory=false or a smaller data.image_size, or use "
+        "fewer of them"
     )
-    check_memory(files, 2)
+    choose_store(files, 2, True)
 
 
 IMAGES = ("image", "alpha", "mask", "depth")

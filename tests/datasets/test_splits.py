@@ -84,3 +84,28 @@ def test_list_file_defines_the_split(photographs):
     dataset, notes = load_noting(photographs)
     assert names(dataset.test) == [3, 5] and len(dataset.train) == 8
     assert notes == [f"{photographs}/train.txt: lists no photograph, and is not read"]
+
+
+@pytest.mark.parametrize("name", ["03", "03.png", "images/03.png", "images/03"])
+def test_photographs_are_left_out_by_name(photographs, name):
+    everything, _ = load_noting(photographs)
+    dataset, _ = load_noting(photographs, leave_out=[name, "08"])
+    assert sorted(names((*dataset.train, *dataset.test))) == [0, 1, 2, 4, 5, 6, 7, 9]
+    assert set(names(dataset.test)) == set(names(everything.test)) - {3, 8}  # the split stays
+    assert dataset.description.endswith("; 2 of these left out")
+
+
+@pytest.mark.parametrize(
+    ("left_out", "message"),
+    [
+        (["3"], "data.leave_out: {} has no photograph 3"),
+        (["03.jpg"], "has no photograph 03.jpg"),
+        (["other/03.png"], "has no photograph other/03.png"),
+        ([""], "has no photograph "),
+        ([f"{k:02d}" for k in range(10)], "data.leave_out: no photograph is left to train on"),
+        (["03", "nowhere"], "has no photograph nowhere"),
+    ],
+)
+def test_names_of_no_photograph_are_refused(photographs, left_out, message):
+    found = refusal(photographs, leave_out=left_out)
+    assert message.format(photographs) in found, found

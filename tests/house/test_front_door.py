@@ -7,7 +7,7 @@ from conftest import REPOSITORY
 
 import drgs
 
-PUBLIC = {"Gaussians", "load_dataset", "rasterization", "train"}
+PUBLIC = {"Gaussians", "examine", "load_dataset", "rasterization", "train"}
 
 LAZILY = """
 import sys

@@ -11,7 +11,7 @@ from support.datasets import dataset_of, edit, load, load_noting, put, view_at, 
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
-from drgs.datasets.viewpoints import focus_of
+from drgs.datasets.viewpoints import focus_of, panorama
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import (
     description_of_start,
@@ -183,6 +183,7 @@ REFUSED_BOXES = [
     (PARALLEL, None, "whose optical axes are parallel; "),
     (OUTWARD, None, "which look away from each other; "),
     (PARALLEL[:1], None, "one training camera, which does not tell how far away"),
+    (list(map(panorama, PARALLEL)), None, "panoramas, which look in all directions; set init.half"),
     (FAR, 1.3, "(around (50, 0, 0), from 4.03 away), but only 1 of 4 have it in the"),
     (EDGE, 0.4, "but only 0 of 4 have it in the middle of their images; set init.ha"),
     (TINY, 1.3, "from 403 away), but it covers only 0.39 % of an image (the "),

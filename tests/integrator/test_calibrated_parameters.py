@@ -78,8 +78,8 @@ def test_missing_coefficients_are_not_exposed():
 
 
 LENS_NAMES = (
-    "there are pinhole, opencv, fisheye, thin_prism_fisheye (others come with installed packages "
-    'that have an entry point of the group "drgs")'
+    "there are pinhole, opencv, fisheye, thin_prism_fisheye, equirectangular (others come with "
+    'installed packages that have an entry point of the group "drgs")'
 )
 
 REFUSED = [
@@ -90,6 +90,11 @@ REFUSED = [
     ({"lens": 3}, f'lens: no lens is called "3"; {LENS_NAMES}'),
     ({"lens": "fisheye", "k5": 0.1}, "lens 'fisheye' has the coefficients k1, k2, k3, k4, got k5"),
     ({"k1": 0.1}, "lens 'pinhole' has no coefficients, got k1"),
+    ({"lens": "equirectangular", "k1": 0.1}, "lens 'equirectangular' has no coefficients, got k1"),
+    (
+        {"lens": "equirectangular", "fx": 10.0, "cy": 3.0},
+        "the film of lens 'equirectangular' is a whole turn, whatever fx and cy; leave them out",
+    ),
     ({"fx": "long"}, "fx must be a positive number, got 'long'"),
     ({"cx": True}, "cx must be a finite number, got True"),
     ({"fy": 0.0}, "fy must be a positive number, got 0.0"),

@@ -31,8 +31,8 @@ MODULES = (
     "integrator.surfaces",
     "light", "light.grid", "light.probe", "light.walk",
     "training.effects.background", "training.effects.cameras", "training.effects.colors",
-    "training.effects.depth", "training.effects.masks", "training.effects.smoothing",
-    "training.effects.view_parameters",
+    "training.effects.depth", "training.effects.masks", "training.effects.photometry",
+    "training.effects.smoothing", "training.effects.view_parameters",
 )  # fmt: skip
 """Modules used only by effects."""
 
@@ -205,6 +205,7 @@ def test_plain_fit_has_no_effects():
     [
         ({}, ["depth", "masks"]),
         ({"colors__lr": 0.1}, ["depth", "colors", "masks"]),
+        ({"colors__vignetting_lr": 0.1}, ["depth", "photometry", "masks"]),
         (EVERYTHING, ["depth", "colors", "background", "masks", "smoothing", "cameras"]),
     ],
 )
@@ -256,6 +257,7 @@ for name, extras, changes in (
     ("smoothing", {{}}, {{"model.smoothing": True}}),
     ("masks", {{"mask": ones}}, {{}}),
     ("colors", {{}}, {{"colors.lr": 0.1}}),
+    ("photometry", {{}}, {{"colors.vignetting_lr": 0.1}}),
     ("cameras", {{}}, {{"cameras.optimise": True}}),
 ):
     config = with_changes(FitConfig(data={{"path": "."}}), changes)
@@ -311,6 +313,7 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "smoothing": ["drgs.effects.smoothing", "drgs.training.effects.smoothing"],
         "masks": ["drgs.training.effects.masks"],
         "colors": ["drgs.training.effects.colors", "drgs.training.effects.view_parameters"],
+        "photometry": ["drgs.training.effects.photometry"],
         "cameras": ["drgs.cameras.motion", "drgs.training.effects.cameras"],
         "calibrated": [],
         "perspective": [],

@@ -22,6 +22,7 @@ from support.formats import (
     matched,
     turned,
 )
+from support.ksplat import content_of
 
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.compressed_ply import CompressedPly
@@ -56,6 +57,14 @@ COARSE = replace(
 )
 
 
+TRUNCATED = replace(
+    PRECISION["sog"],
+    **{name: 2 * getattr(PRECISION["sog"], name) for name in ("means", "quats", "opacities")},
+    harmonics=0.7,  # its palette has 512 entries for 600 Gaussians
+)
+"""Values cut off where ours are rounded."""
+
+
 def convert(*arguments) -> None:
     command = ["node", CLI, "--overwrite", "--quiet", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
@@ -69,6 +78,7 @@ def convert(*arguments) -> None:
         (".compressed.ply", SAME, ALIKE),
         (".splat", SAME, replace(ALIKE, quats=PRECISION["splat"].quats)),  # it divides by 255
         (".spz", SPZ_WORLD, ALIKE),
+        (".sog", SAME, ALIKE),
     ],
 )
 def test_our_files_are_read_by_splat_transform(tmp_path, suffix, rotation, precision):
@@ -86,6 +96,7 @@ def test_our_files_are_read_by_splat_transform(tmp_path, suffix, rotation, preci
         (".compressed.ply", [], SAME, PRECISION["compressed-ply"]),
         (".spz", ["--spz-version", "3"], SPZ_WORLD.T, COARSE),
         (".spz", ["--spz-version", "4"], SPZ_WORLD.T, COARSE),
+        (".sog", ["--gpu", "cpu"], SAME, TRUNCATED),
         (".glb", [], Z_TO_Y.T @ HALF_TURN, ALIKE),
     ],
 )
@@ -97,6 +108,16 @@ def test_files_of_splat_transform_are_read(tmp_path, suffix, options, rotation, 
     convert(tmp_path / "ours.ply", path, *options)
     expected = turned(Gaussians.load(tmp_path / "ours.ply"), rotation)
     assert_within(precision, expected, matched(expected, Gaussians.load(path)))
+
+
+@splat_transform
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_ksplat_files_are_read_as_splat_transform_reads_them(tmp_path, level):
+    gaussians = gaussians_within_ranges(100, degree=2)
+    (tmp_path / "a.ksplat").write_bytes(content_of([(gaussians, 5)], level))
+    convert(tmp_path / "a.ksplat", tmp_path / "theirs.ply")
+    found, expected = (Gaussians.load(tmp_path / name) for name in ("a.ksplat", "theirs.ply"))
+    assert_within(ALIKE, expected, matched(expected, found))
 
 
 FLOATS = Precision(*(40 * FLOAT32,) * 4, 10 * FLOAT32, 40 * FLOAT32)

@@ -337,13 +337,41 @@ def with_lines(path, *lines):
 
 def test_each_value_is_a_comment_and_is_read_back_with_its_type(tmp_path):
     replace(gaussians_within_ranges(2), rendered_with=VALUES).save(tmp_path / "a.ply")
-    expected = with_lines(tmp_path / "b.ply", *LINES).read_bytes()
+    expected = with_lines(tmp_path / "b.ply", *LINES, b"comment SplatRenderMode: mip").read_bytes()
     assert (tmp_path / "a.ply").read_bytes() == expected
     found = Gaussians.load(tmp_path / "a.ply")
     assert found.rendered_with == VALUES
     assert [type(v) for v in found.rendered_with.values()] == [bool, float, int, str, float, float]
     assert from_ply_header("a.ply", found.rendered_with) == VALUES
     assert found.to(TensorXf).numpy().rendered_with == VALUES
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ([b"comment SplatRenderMode: mip"], {"antialiased": True}),
+        ([b"comment splatrendermode:mip "], {"antialiased": True}),
+        ([b"comment Postshot v1.0.0", b"comment postshot.anti_aliasing=1"], {"antialiased": True}),
+        ([b"comment antialiased 1"], {"antialiased": True}),
+        ([b"comment SplatRenderMode: default"], None),
+        ([b"comment postshot.anti_aliasing=0"], None),
+        (
+            [b"comment SplatRenderMode: mip", b"comment drgs antialiased false"],
+            {"antialiased": False},
+        ),
+    ],
+)
+def test_marks_of_other_programs_are_read_as_antialiased(tmp_path, lines, expected):
+    assert Gaussians.load(with_lines(tmp_path / "a.ply", *lines)).rendered_with == expected
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
+@pytest.mark.parametrize("values", [VALUES, {"low_pass": 0.1}, {"antialiased": False}])
+def test_antialiased_is_marked_for_other_programs(tmp_path, suffix, values):
+    path = tmp_path / f"a{suffix}"
+    replace(gaussians_within_ranges(2), rendered_with=values).save(path)
+    marked = b"\ncomment SplatRenderMode: mip\n" in path.read_bytes()
+    assert marked == (values is VALUES)
 
 
 @pytest.mark.parametrize(

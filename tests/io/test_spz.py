@@ -99,6 +99,18 @@ def test_extensions_are_skipped(tmp_path):
     assert all((found[name] == expected[name]).all() for name in expected)
 
 
+def test_harmonics_of_degree_4_are_read_to_degree_3(tmp_path):
+    content = unpacked(gaussians_within_ranges(5))
+    expected, _ = Spz().read(written(tmp_path / "a.spz", content))
+    rows = np.frombuffer(bytes(content[-5 * 45 :]), "u1").reshape(5, 45)
+    longer = np.concatenate([rows, np.full((5, 27), 7, "u1")], axis=1)  # 9 coefficients more
+    content[-5 * 45 :] = longer.tobytes()
+    content[DEGREE] = 4
+    with pytest.warns(UserNote, match=r"b.spz: harmonics of degree 4: read to degree 3"):
+        found, _ = Spz().read(written(tmp_path / "b.spz", content))
+    assert all((found[name] == expected[name]).all() for name in expected)
+
+
 @pytest.mark.parametrize(
     ("at", "data", "message"),
     [
@@ -107,7 +119,7 @@ def test_extensions_are_skipped(tmp_path):
         (NUM, struct.pack("<I", 0), "byte 0: the number of Gaussians must be from 1 to"),
         (NUM, struct.pack("<I", 2**31), "a scene of 2,147,483,648 Gaussians takes about"),
         (NUM, struct.pack("<I", 6), "byte 136 of the unpacked stream: 270 bytes were expected"),
-        (DEGREE, b"\4", "byte 0: the degree of harmonics must be from 0 to 3, got 4"),
+        (DEGREE, b"\5", "byte 0: the degree of harmonics must be from 0 to 4, got 5"),
         (BITS, b"\x19", "byte 0: the number of fractional bits of positions must be from 0 to 24"),
     ],
 )

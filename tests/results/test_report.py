@@ -198,10 +198,10 @@ def test_panels_show_the_history():
     assert tested.y == pytest.approx([8.5, 9])
 
 
-def test_page_has_no_external_references_and_its_images_are_complete(page, out):
+def test_page_has_no_external_references_and_its_images_are_complete(page, out, dataset):
     embedded = [reference for reference in page.references if reference.startswith("data:")]
-    # The icon, the orbit and its first frame, comparisons, curves.
-    assert len(embedded) == 1 + 2 + 3 * 3 + 6
+    # The icon, the orbit and its first frame, comparisons, curves, the worst photographs.
+    assert len(embedded) == 1 + 2 + 3 * 3 + 6 + min(6, len(dataset.train))
     # To be downloaded, and to walk around in.
     links = {"point_cloud.ply", "point_cloud_viewers.ply", "viewer.html"}
     assert set(page.references) - set(embedded) == links
@@ -252,7 +252,8 @@ def test_photographs_with_hostile_names_are_shown_as_text(tmp_path, dataset, out
     """The first image equals its photograph."""
     test = tuple(replace(view, name=f"<b>{view.name}") for view in dataset.test)
     dataset = replace(dataset, test=test, description=HOSTILE, test_split=HOSTILE, rendered=False)
-    images = {view.name: view.image * (0.5 if k else 1) for k, view in enumerate(test)}
+    views = (*test, *dataset.train)
+    images = {view.name: np.asarray(view.image) * (0.5 if k else 1) for k, view in enumerate(views)}
     scores = [report.score(images[view.name], view) for view in test]
     path, orbit = tmp_path / "report.html", (out / "orbit.webp").read_bytes()
     facts = (lambda views: [images[view.name] for view in views]), scores, history()

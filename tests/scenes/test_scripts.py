@@ -23,7 +23,10 @@ SCRIPTS = {
     "among_surfaces": ((), set()),
     "gallery": (
         (),
-        {f"out/gallery/{n}.jpg" for n in ("defocus", "depth", "fisheye", "normals", "popping")},
+        {
+            f"out/gallery/{n}.jpg"
+            for n in ("defocus", "depth", "fisheye", "normals", "panorama", "popping")
+        },
     ),
     "relight": ((KNOT,), {"out/relight/target.png"}),
 }

@@ -147,6 +147,6 @@ def test_weighted_sums_are_image_contributions_times_the_plane(precision, sh_dir
     approximations = Approximations(sh_direction=sh_direction)
     pipeline = pipeline_of(approximations, case.rendered_degree)
     _, frame = render(case, precision, pipeline)
-    got = np.array(rendering.weighted_sums(frame, precision.array(plane)), np.float64)
+    got = np.array(rendering.weighted_sums(frame, precision.array(plane))[0], np.float64)
     assert np.max(expected) > 1
     np.testing.assert_allclose(got, expected, atol=IMAGE[precision] * np.max(expected))

@@ -9,7 +9,13 @@ import numpy as np
 
 from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.reference.effects import Fisheye, OpenCV, Pinhole, ThinPrismFisheye
+from drgs.reference.effects import (
+    Equirectangular,
+    Fisheye,
+    OpenCV,
+    Pinhole,
+    ThinPrismFisheye,
+)
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES
 from support.motion_checks import rolling_image
@@ -23,6 +29,7 @@ KINDS = {
     OpenCV: "opencv",
     Fisheye: "fisheye",
     ThinPrismFisheye: "thin_prism_fisheye",
+    Equirectangular: "equirectangular",
 }
 
 
@@ -43,6 +50,11 @@ class Calibrated:
         given = {} if isinstance(self.lens, Pinhole) else asdict(self.lens)
         return {name: value for name, value in given.items() if value != 0}
 
+    @property
+    def intrinsics(self) -> dict[str, float]:
+        numbers = dict(zip(("fx", "fy", "cx", "cy"), (*self.f, *self.c), strict=True))
+        return {} if isinstance(self.lens, Equirectangular) else numbers
+
     def dictionary(self, **others) -> dict:
         common = self.view.sensor()
         kind = KINDS[type(self.lens)]
@@ -50,7 +62,7 @@ class Calibrated:
         return {
             "type": "calibrated",
             "lens": kind,
-            **dict(zip(("fx", "fy", "cx", "cy"), (*self.f, *self.c), strict=True)),
+            **self.intrinsics,
             **self.coefficients,
             **{name: common[name] for name in ("near_clip", "to_world", "film", "sampler")},
             **moves,
@@ -117,7 +129,8 @@ FILM = View("", 37, 29)  # without a crop window
 
 # A fold within the film.
 BARREL = Calibrated("barrel", LENSES["barrel"], FILM, f=(26.0, 26.0), c=(19.0, 14.0))
-STATIC_SENSORS = [PINHOLE, OPENCV, FISHEYE, THIN_PRISM]
+PANORAMA = Calibrated("panorama", LENSES["panorama"])
+STATIC_SENSORS = [PINHOLE, OPENCV, FISHEYE, THIN_PRISM, PANORAMA]
 
 by_name = {"ids": lambda sensor: sensor.name}
 

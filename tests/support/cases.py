@@ -186,6 +186,24 @@ def needles(case) -> Values:
     return {**values, "quats": single(quats), "log_scales": single(np.log(scales))}
 
 
+def all_around(case) -> Values:
+    """Splats in all directions: one at each pole, two at the seam, one as wide as the film."""
+    rng, (rotation, center), n = np.random.default_rng(case.seed), case.pose, case.count
+    points = rng.normal(size=(n, 3))
+    points[:5] = [[0.1, 3, -0.2], [-0.1, -2, 0.05], [0.01, 0.3, -3], [-0.02, -1, -2], [1, 2, 0]]
+    distances = np.linalg.norm(points, axis=1)
+    sizes = rng.lognormal(np.log(0.15), 0.5, (n, 3)) * distances[:, None]
+    sizes[4] *= 6
+    shapes = {"sh0": (n, 1, 3), "shN": (n, (case.degree + 1) ** 2 - 1, 3)}
+    return {
+        "means": single(points @ rotation + center),
+        "quats": single(rng.normal(size=(n, 4))),
+        "log_scales": single(np.log(sizes)),
+        "logit_opacities": single(rng.normal(0.5, 1.5, n)),
+        **{k: single(rng.normal(0, 0.5, shape)) for k, shape in shapes.items()},
+    }
+
+
 # ----------------------------------------------------------------------------------------------
 # The matrix
 # ----------------------------------------------------------------------------------------------
@@ -193,7 +211,10 @@ def needles(case) -> Values:
 ALL_LENSES = {"pinhole": PINHOLE, **LENSES}
 
 # px: films of fisheyes reach beyond 90 degrees from the axis; that of parallel rays is 3 units.
-FOCAL = {effects.Fisheye: 10.0, effects.ThinPrismFisheye: 10.0, effects.Orthographic: 12.0}
+FOCAL = {
+    **{effects.Fisheye: 10.0, effects.ThinPrismFisheye: 10.0, effects.Orthographic: 12.0},
+    effects.Equirectangular: 6.0,
+}
 
 
 def with_lens(name, effect, reference_of, **options) -> Case:
@@ -202,6 +223,8 @@ def with_lens(name, effect, reference_of, **options) -> Case:
     if name != "pinhole":
         options["lens"] = kernel_lens(lens)
     options.setdefault("focal", FOCAL.get(type(lens), 26.0))
+    if isinstance(lens, effects.Equirectangular):
+        options.setdefault("scene", all_around)
     found = reference_of and partial(reference_of, lens=lens)
     return Case(f"{effect}, {name}", reference=found, **options)
 
@@ -251,7 +274,10 @@ EFFECTS = {
 NO_SENSOR = "in focus by z in kernels, by distance in the reference; no sensor has both"
 HOLES = {
     ("thin lens", "orthographic"): "parallel rays meet in no aperture",
-    **{("thin lens", name): NO_SENSOR for name in ("plain fisheye", "fisheye", "thin prism")},
+    **{
+        ("thin lens", name): NO_SENSOR
+        for name in ("plain fisheye", "fisheye", "thin prism", "panorama")
+    },
 }
 """Cells of the matrix without a case, and the reason."""
 

@@ -16,9 +16,8 @@ def _values(names):
     return (*size, 320.5, 239.0, *coefficients)
 
 
-PARAMETERS = {
-    name: _values(names) for name, (_, names) in MODELS.items() if name != "EQUIRECTANGULAR"
-}
+PARAMETERS = {name: _values(names) for name, (_, names) in MODELS.items()}
+PARAMETERS["EQUIRECTANGULAR"] = (640.0, 480.0)
 """Parameters of a 640 x 480 px camera, by model."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -92,6 +93,16 @@ PRECISION = {
         colors=0,
         harmonics=8 * FLOAT32,
     ),
+    "sog": Precision(
+        # 16 bits of log(1 + |x|), whose span is 2 log 3, and dx = (1 + |x|) d log(1 + |x|).
+        means=3 * half_step(2 * np.log(3), 16),
+        quats=smallest_three(np.sqrt(2) / 255),
+        # Codebooks of 256 numbers for a few hundred: cells that are twice as wide as equal steps.
+        log_scales=2 * half_step(6, 8),
+        opacities=half_step(1, 8),
+        colors=2 * half_step(1, 8),
+        harmonics=2 * half_step(0.7, 8),
+    ),
     "splat": Precision(
         means=0,
         # Four components off by 1/256, 1 itself by 1/128, before the quaternion is normalised.
@@ -102,7 +113,14 @@ PRECISION = {
         harmonics=0,
     ),
 }
+PRECISION["usd"] = PRECISION["glb"]
 """Precision of each format, from its bits."""
+
+
+def each_of(formats):
+    """Return parameters of tests for formats; those of OpenUSD are skipped without it."""
+    missing = pytest.mark.skipif(not find_spec("pxr"), reason="usd-core is not installed")
+    return [pytest.param(f, id=f.name, marks=[missing] * (f.name == "usd")) for f in formats]
 
 
 def turned(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:

@@ -9,13 +9,13 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from drgs.cameras import fisheye, orthographic, thin_prism_fisheye
+from drgs.cameras import equirectangular, fisheye, orthographic, thin_prism_fisheye
 from drgs.cameras.camera import Aperture, Camera
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.reference.effects import Fisheye, OpenCV, Orthographic, ThinPrismFisheye
+from drgs.reference.effects import Equirectangular, Fisheye, OpenCV, Orthographic, ThinPrismFisheye
 from drgs.splatting import rendering
 from drgs.splatting.projection import ewa, load_rows, plain_opacity, project
 from support.helpers import (
@@ -51,6 +51,7 @@ LENSES = {
     "fisheye": FISHEYE,
     "thin prism": THIN_PRISM,
     "orthographic": Orthographic(),
+    "panorama": Equirectangular(),
 }
 
 
@@ -64,6 +65,8 @@ def kernel_lens(lens: effects.Lens) -> object:
         return RadialTangential.from_coefficients(**given)
     if isinstance(lens, ThinPrismFisheye):
         return thin_prism_fisheye.ThinPrismFisheye.from_coefficients(**given)
+    if isinstance(lens, Equirectangular):
+        return equirectangular.Equirectangular()
     return (
         fisheye.Fisheye.from_coefficients(**given)
         if isinstance(lens, Fisheye)
@@ -86,6 +89,10 @@ def points_at(lens: effects.Lens, camera: reference.Camera, film, distances) -> 
     distances (N,): z, or from the centre where that is the depth. By the inverse of the reference:
     Newton's method with halved steps, or from a table of the angle.
     """
+    if isinstance(lens, Equirectangular):
+        theta, phi = np.pi * (film / [camera.width, camera.height] - 0.5).T * [[2], [1]]
+        directions = [np.sin(theta) * np.cos(phi), np.sin(phi), np.cos(theta) * np.cos(phi)]
+        return np.column_stack(directions) * distances[:, None]
     plane = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     if isinstance(lens, Orthographic):
         return np.column_stack([plane, distances])
@@ -179,7 +186,8 @@ def camera_behind(case, rng) -> reference.Camera:
     With a fisheye they are up to 140 degrees, with a barrel beyond the fold.
     """
     size = np.array([case.width, case.height])
-    focal = max(size) * {Fisheye: 0.27, Orthographic: 0.3}.get(type(case.lens), 0.7)
+    factors = {Fisheye: 0.27, Orthographic: 0.3, Equirectangular: 0.16}
+    focal = max(size) * factors.get(type(case.lens), 0.7)
     fx, fy = focal * rng.uniform(0.9, 1.1, 2)
     if case.defocus is not None:
         fy = fx

@@ -103,6 +103,13 @@ def transparent_dataset(background=WHITE) -> Dataset:
     return with_views(true_dataset(background), lambda v: replace(v, depth=None))
 
 
+def two_camera_dataset(dataset: Dataset | None = None) -> Dataset:
+    """Photographs, every other one by another camera with nearly the same intrinsics."""
+    dataset = dataset or plain_dataset()
+    train = [replace(v, cx=v.cx + 1e-4 * (k % 2)) for k, v in enumerate(dataset.train)]
+    return replace(dataset, train=tuple(train))
+
+
 def shifted_dataset() -> Dataset:
     """The photographs with alpha, from files of twice the size: four equal pixels each."""
 

@@ -27,7 +27,7 @@ def examples():
 def configured(**changes):
     """The configuration of a small fit with the examples, from nested mappings."""
     values = fits.config_of().model_dump()
-    values["densify"] = {"strategy": "halving"}
+    values["densify"] = {"strategy": "halving", "remove_floaters": False}
     values["loss"] = {"type": "charbonnier"}
     values["extensions"] = {
         "halving": {"after": 6},

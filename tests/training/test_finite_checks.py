@@ -180,7 +180,7 @@ def test_nonfinite_value_is_detected_without_a_nonfinite_gradient():
 
 def test_nonfinite_statistics_are_named():
     """A gradient of positions on the film that overflows may leave all parameters' gradients."""
-    trainer = make_trainer(densify={"strategy": "adc"})
+    trainer = make_trainer(densify={"strategy": "adc", "remove_floaters": False})
     trainer.step()
     trainer.density.gradient_norms = with_value(trainer.density.gradient_norms, ROW, np.nan)
     with pytest.raises(NonFiniteError, match=f"gradient_norms is nan in row {ROW}$"):

@@ -36,6 +36,8 @@ LATE_STEPS = {
 
 CAMERAS = {"cameras__optimise": True, **fits.CAMERA_RATES}
 COLORS = {"colors__lr": 2e-3, "colors__identity_weight": 0.1}
+VIGNETTING = {"colors__vignetting_lr": 2e-3}
+PHOTOMETRY = {**VIGNETTING, "colors__response_lr": 2e-3}
 DEPTH = {"loss__depth_weight": 0.7}
 RANDOM = {"data__random_background": True}
 SMOOTHING = {"model__smoothing": True}
@@ -60,7 +62,8 @@ SLOW_FITS = {
     "cameras, smoothing": (plain, {**CAMERAS, **SMOOTHING, **ADC}, 6, 5),
     **STRATEGIES,
     "effects, four views a step": (
-        *(transparent, {**FOUR_VIEWS, **CAMERAS, **COLORS, **RANDOM, **SMOOTHING}),
+        transparent,
+        {**FOUR_VIEWS, **CAMERAS, **COLORS, **VIGNETTING, **RANDOM, **SMOOTHING},
         *(3, 4),
     ),
     "late steps of eight views": (plain, {**FOUR_VIEWS, **COARSE, "optimizer__views": 8}, 3, 4),
@@ -69,6 +72,7 @@ SLOW_FITS = {
 QUICK_FITS = {
     "coarse": (plain, COARSE, 4, 4),
     "colors": (plain, COLORS, 4, 5),
+    "photometry": (fits.two_camera_dataset, PHOTOMETRY, 4, 5),
     "depth and masks": (masked_with_depth, DEPTH, 4, 5),
     "random background": (transparent, {**RANDOM, **COARSE}, 2, 4),
     "shifted pixels": (fits.shifted_dataset, RANDOM, 11, 5),
@@ -94,6 +98,7 @@ EFFECTS = {
     "random background": (transparent, RANDOM),
     "cameras": (plain, CAMERAS),
     "colors": (plain, COLORS),
+    "photometry": (fits.two_camera_dataset, PHOTOMETRY),
     "smoothing": (plain, SMOOTHING),
 }
 

@@ -68,7 +68,8 @@ class Squares(Loss):
 @pytest.mark.slow
 def test_objects_are_used_and_other_trainers_get_copies_of_them(tmp_path):
     """A rehearsal gets all of them; Gaussians for viewers, whose number stays, no strategy."""
-    config, effect = load_config(write_project(tmp_path)), Blue()
+    density, effect = {**VALUES["densify"], "remove_floaters": False}, Blue()
+    config = load_config(write_project(tmp_path, densify=density))
     session = FitSession(config, strategy=Halves(), effects=[effect], loss=Squares())
     session.prepare()
     assert session.run() and effect.count == VALUES["iterations"]

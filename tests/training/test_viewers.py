@@ -54,6 +54,7 @@ def test_iterations_improve_images_of_viewers(monkeypatch):
 def test_refined_cameras_and_colours_are_kept():
     """Its rates are next to nothing; the views to measure are those of the refined cameras."""
     changes = {"cameras.optimise": True, "cameras.rotation_lr": 1e-3, "colors.lr": 0.02}
+    changes["colors.vignetting_lr"] = 0.02
     trainer, _, gaussians = ended_fit(8, **changes)
     before = {effect.name: effect.values() for effect in trainer.effects}
     tuners = []
@@ -63,7 +64,8 @@ def test_refined_cameras_and_colours_are_kept():
         for name, values in effect.values().items():
             np.testing.assert_array_equal(values, before[effect.name][name])
     config = tuning(trainer.config)
-    assert config.colors.lr == viewers.NEGLIGIBLE_RATE and config.cameras.rotation_lr == 0
+    assert config.colors.lr == config.colors.vignetting_lr == viewers.NEGLIGIBLE_RATE
+    assert config.cameras.rotation_lr == 0 and len(found.effects) == 3
 
 
 def test_nonfinite_values_fall_back_to_the_closed_form(monkeypatch):

@@ -158,7 +158,7 @@ class DensityStrategy(Protocol):
 def density_strategy(
     config: FitConfig, dataset: Dataset | None = None, growth: DensityStrategy | None = None
 ) -> DensityStrategy:
-    """Return the strategy of a fit: growth, and a last phase if there is one.
+    """Return the strategy of a fit: growth, and what removes floaters and the least Gaussians.
 
     dataset: None for an estimate; growth: a strategy instead of ``densify.strategy``.
     """
@@ -169,9 +169,12 @@ def density_strategy(
         return strategy.value.from_config(config, dataset, section)
 
     growth = make(config.densify.strategy) if growth is None else growth
-    if config.densify.prune.to is None:
-        return growth
-    return Phases([growth, make(config.densify.prune.method)])
+    phases = [growth]
+    if config.densify.remove_floaters:
+        phases.append(make("floaters"))
+    if config.densify.prune.to is not None:
+        phases.append(make(config.densify.prune.method))
+    return growth if len(phases) == 1 else Phases(phases)
 
 
 class Phases(DensityStrategy):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,8 +18,10 @@ from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host
 from drgs.core.errors import UserError
 from drgs.core.types import Float, TensorXf
+from drgs.datasets.images import with_arrays
 from drgs.datasets.types import Dataset, View
 from drgs.integrator.types import SplatsPlugin
+from drgs.training.findings import Finding, ShortFit
 from drgs.training.losses import Target, prepare_target
 
 
@@ -40,22 +43,34 @@ class TrainingView:
         """index: among the training views; window: width and sigma of SSIM's window, px."""
         self.name, self.width, self.height = view.name, view.width, view.height
         self.index, self.sensor = index, sensor
-        self.uploads = Uploads(view, effects)
+        self.uploads = Uploads(self, effects)
         self.replacement: Target | None = None  # an effect's
         self._view, self._effects, self._window = view, effects, window
+        self._ahead: Future[View] | None = None
+
+    def read_ahead(self, thread: Executor) -> None:
+        """Let a thread compute the images, which are on disk, for the next use of them."""
+        if self._ahead is None:
+            self._ahead = thread.submit(with_arrays, self._view)
+
+    @property
+    def dataset_view(self) -> View:
+        """The dataset's view; its images are arrays if they were read ahead."""
+        return self._view if self._ahead is None else self._ahead.result()
 
     @cached_property
     def counted_share(self) -> float:
         """The share of pixels that are not masked."""
-        mask = self._view.mask
+        mask = self.dataset_view.mask
         return 1.0 if mask is None else max(float(np.asarray(mask).mean()), 1e-10)
 
     @cached_property
     def photograph(self) -> Target:
         """The photograph on the device."""
-        image = np.asarray(self._view.image)
+        view = self.dataset_view
+        image = np.asarray(view.image)
         for effect in self._effects:
-            image = effect.target_image(self._view, image)
+            image = effect.target_image(view, image)
         return prepare_target(as_tensor(image), *self._window)
 
     @property
@@ -67,17 +82,18 @@ class TrainingView:
         """Free target and uploads; they are computed again when needed."""
         self.__dict__.pop("photograph", None)
         self.uploads.clear()
+        self._ahead = None
 
 
 class Uploads(dict[str, Any]):
     """Device arrays of a view by effect, in any PyTree, made when they are needed."""
 
-    def __init__(self, view: View, effects: Sequence[TrainingEffect]) -> None:
+    def __init__(self, owner: TrainingView, effects: Sequence[TrainingEffect]) -> None:
         super().__init__()
-        self._view, self._effects = view, {effect.name: effect for effect in effects}
+        self._owner, self._effects = owner, {effect.name: effect for effect in effects}
 
     def __missing__(self, name: str) -> object:
-        self[name] = upload = self._effects[name].upload(self._view)
+        self[name] = upload = self._effects[name].upload(self._owner.dataset_view)
         return upload
 
 
@@ -122,6 +138,14 @@ class TrainingEffect(Protocol):
         """
         make = cast("Callable[..., TrainingEffect]", cls)
         return make() if section is None else make(section)
+
+    @classmethod
+    def look_for(cls, fit: ShortFit) -> Finding | None:
+        """Return what a short fit without the effect shows of it; None: nothing can be said.
+
+        See :mod:`drgs.training.examination`, which tries and chooses what is likely.
+        """
+        return None
 
     name = ""  # of its part of a checkpoint, and of its uploads
     moves_sensors = False  # whether it changes the parameters of sensors
@@ -227,6 +251,7 @@ def _is_shipped_used(name: str, config: FitConfig, dataset: Dataset) -> bool:
         return any(view.mask is not None for view in views)
     return {
         "colors": config.colors.lr is not None,
+        "photometry": (config.colors.vignetting_lr, config.colors.response_lr) != (None, None),
         "background": config.data.random_background,
         "smoothing": config.model.smoothing,
         "cameras": config.cameras.optimise,
@@ -247,3 +272,10 @@ def as_numbers(values: np.ndarray) -> Float:
 def as_tensor(values: np.ndarray) -> TensorXf:
     """Upload an array of any shape."""
     return cast(TensorXf, mi.TensorXf(from_host(mi.Float, values), values.shape))
+
+
+def opacity_of(view: View) -> TensorXf | None:
+    """Upload a photograph's opacity, (H, W, 3); None where it is opaque everywhere."""
+    if view.alpha is None:
+        return None
+    return as_tensor(np.repeat(np.asarray(view.alpha)[:, :, None], 3, axis=2))

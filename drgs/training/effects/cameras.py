@@ -30,8 +30,12 @@ from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import LensChange, cameras_json
 from drgs.training.effects.base import FitState, TrainingView
 from drgs.training.effects.view_parameters import OptimisedEffect
+from drgs.training.findings import Finding, ShortFit
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
+
+MIN_SHIFT_PX = 0.35  # RMS, of photographs in a short fit; without wrong poses: 0.04 to 0.25
+SHORT_FIT_RATE = 1e-3  # of poses, which a short fit moves fewer times
 
 MAX_FOCAL_FACTOR = 1000  # up or down
 
@@ -57,6 +61,23 @@ class CameraRefinement(OptimisedEffect):
     @override
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> CameraRefinement:
         return cls(config.cameras, len(dataset.train), dataset.extent)
+
+    @classmethod
+    @override
+    def look_for(cls, fit: ShortFit) -> Finding | None:
+        """Measure by how much held-out photographs are shifted against their renderings."""
+        if fit.config.model.sh_direction != "mean":
+            return None
+        shifts = np.stack([alignment.shift for alignment in fit.alignments])
+        root_mean_square = float(np.sqrt(np.square(shifts).sum(axis=1).mean()))
+        rate = SHORT_FIT_RATE
+        return Finding(
+            "camera refinement",
+            f"photographs are shifted by {root_mean_square * fit.factor:.1f} px",
+            is_likely=root_mean_square > MIN_SHIFT_PX,
+            changes={"cameras.optimise": True},
+            in_short_fits={"cameras.rotation_lr": rate, "cameras.translation_lr": rate},
+        )
 
     def __init__(self, config: CamerasConfig, num_views: int, extent: float) -> None:
         """num_views: of the training split; extent: world units."""

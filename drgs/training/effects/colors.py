@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import cast
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 from typing_extensions import override
 
@@ -25,17 +24,26 @@ from drgs.core.files import atomic_path
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.results.files import COLORS
-from drgs.training.effects.base import FitState, TrainingView, as_numbers, as_tensor
-from drgs.training.effects.view_parameters import OptimisedEffect
+from drgs.training.effects.base import FitState, TrainingView, as_numbers, opacity_of
+from drgs.training.effects.view_parameters import CenteredEffect
+from drgs.training.findings import Finding, ShortFit, exposure_spread
+
+EXAMINED_LR = 0.02  # of the transforms where an examination chooses them
+
+MIN_BRIGHTNESS_DEVIATION, MIN_COLOR_DEVIATION = 0.025, 0.012
+"""Standard deviations of photographs' gains, and of colours' gains in a photograph, from which a
+short fit is worth its time: about twice those of renderings and photographs without differences."""
+
+MIN_STOPS = 0.1  # the same, of the exposures that EXIF gives
 
 IDENTITY = np.eye(3, 4).reshape(1, 12)  # the identity, row by row
 
 
 @EFFECTS.register("colors")
-class ColorCorrection(OptimisedEffect):
+class ColorCorrection(CenteredEffect):
     """A 3 x 4 transform for each view."""
 
-    name = "colors"
+    name, centered = "colors", "matrices"
     upload_bytes = 12
 
     @classmethod
@@ -43,23 +51,38 @@ class ColorCorrection(OptimisedEffect):
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> ColorCorrection:
         return cls(config.colors, len(dataset.train))
 
+    @classmethod
+    @override
+    def look_for(cls, fit: ShortFit) -> Finding:
+        """Compare the gains of held-out photographs over their renderings."""
+        gains = np.stack([alignment.gains for alignment in fit.alignments])
+        exposures = gains.mean(axis=1)
+        by_view, by_color = float(exposures.std()), float((gains - exposures[:, None]).std())
+        evidence = f"brightness differs by {by_view:.1%}, colours by {by_color:.1%}"
+        views = (*fit.dataset.train, *fit.dataset.test)
+        stops = exposure_spread([v.files["image"] for v in views if "image" in v.files])
+        if stops is not None:
+            evidence += f", EXIF's exposures by {stops:.1f} stops"
+        is_seen = by_view > MIN_BRIGHTNESS_DEVIATION or by_color > MIN_COLOR_DEVIATION
+        return Finding(
+            "exposure and white balance",
+            evidence,
+            is_likely=is_seen or (stops or 0.0) > MIN_STOPS,
+            changes={"colors.lr": EXAMINED_LR},
+        )
+
     def __init__(self, config: ColorConfig, num_views: int) -> None:
         """num_views: of the training split."""
         self.weight = config.identity_weight
         assert config.lr is not None, "the effect is used where it is given"
         values = {"matrices": np.repeat(IDENTITY, num_views, axis=0)}
         super().__init__(values, {"matrices": config.lr})
-        # Mean change of all transforms, which is subtracted; not differentiated.
-        self.common = cast(Float, dr.opaque(mi.Float, 0, IDENTITY.size))
-        self.share = 1 / num_views
         self.matrix: Float  # (12,), of the view that is rendered
 
     @override
     def upload(self, view: View) -> TensorXf | None:
         """Return the photograph's opacity, (H, W, 3); None where it is opaque everywhere."""
-        if view.alpha is None:
-            return None
-        return as_tensor(np.repeat(np.asarray(view.alpha)[:, :, None], 3, axis=2))
+        return opacity_of(view)
 
     @override
     def before_render(self, fit: FitState, view: TrainingView) -> None:
@@ -82,27 +105,13 @@ class ColorCorrection(OptimisedEffect):
     def after_backward(
         self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
     ) -> None:
-        """Step the view's transform, and subtract the mean change from all."""
         dr.set_grad(self.leaves(view), derivatives)
-        before = self.numbers_of(view)["matrices"]
         self.step(view, fit.rate_decay)
-        after = self.numbers_of(view)["matrices"]
-        self.common = self.common + (after - before) * self.share
-        dr.eval(self.common)
 
     def transforms(self) -> np.ndarray:
         """Return the transforms of all training views, (V, 3, 4)."""
         matrices = self.numpy()["matrices"] - np.array(self.common)
         return matrices.reshape(-1, 3, 4)
-
-    @override
-    def state(self) -> dict[str, np.ndarray]:
-        return {**super().state(), "common": np.array(self.common)}
-
-    @override
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        super().restore(state)
-        self.common = as_numbers(state["common"])
 
     @override
     def write(self, folder: Path, dataset: Dataset) -> None:

@@ -12,7 +12,7 @@ from drjit.opt import Adam
 from typing_extensions import override
 
 from drgs.core.types import Float
-from drgs.training.effects.base import TrainingEffect, TrainingView
+from drgs.training.effects.base import TrainingEffect, TrainingView, as_numbers
 from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
 
 
@@ -84,3 +84,38 @@ class OptimisedEffect(TrainingEffect):
         return {
             name: rows[min(view.index, len(rows) - 1)] for name, rows in self.optimizers.items()
         }
+
+
+class CenteredEffect(OptimisedEffect):
+    """Parameters of which one, ``centered``, has the mean change of all rows subtracted.
+
+    Splats would absorb a change that all rows have in common. The mean is not differentiated.
+    """
+
+    centered: str  # name of the parameter
+
+    @override
+    def __init__(self, values: Mapping[str, np.ndarray], rates: Mapping[str, float]) -> None:
+        super().__init__(values, rates)
+        num_rows, size = np.shape(values.get(self.centered, np.zeros((1, 1))))
+        self.common = cast(Float, dr.opaque(mi.Float, 0, size))  # mean change of all rows
+        self.share = 1 / num_rows
+
+    @override
+    def step(self, view: TrainingView, decay: float) -> None:
+        """Move the view's numbers, and the mean of all rows with them."""
+        before = self.numbers_of(view).get(self.centered)
+        super().step(view, decay)
+        if before is not None:
+            after = self.numbers_of(view)[self.centered]
+            self.common = self.common + (after - before) * self.share
+            dr.eval(self.common)
+
+    @override
+    def state(self) -> dict[str, np.ndarray]:
+        return {**super().state(), "common": np.array(self.common)}
+
+    @override
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        super().restore(state)
+        self.common = as_numbers(state["common"])

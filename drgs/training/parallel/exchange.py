@@ -229,7 +229,7 @@ class ViewExchange:
         for name, plane in weights.items():
             sums = []
             for time, frame in enumerate(each.frames):
-                own = self._divide(each, time, [weighted_sums(frame, plane)])
+                own = self._divide(each, time, weighted_sums(frame, plane))
                 sums.append(own[0])
             each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
         each.frames.clear()

@@ -48,6 +48,8 @@ READERS = {
     "gaussians.compressed.ply": ("render", "gaussians.compressed.ply", *CAMERA),
     "gaussians.spz": ("render", "gaussians.spz", *CAMERA),
     "gaussians.glb": ("render", "gaussians.glb", *CAMERA),
+    "gaussians.sog": ("render", "gaussians.sog", *CAMERA),
+    "gaussians.ksplat": ("render", "gaussians.ksplat", *CAMERA),
     "gaussians.splat": ("render", "gaussians.splat", *CAMERA),
     "camera.json": ("render", "gaussians.ply", "--camera", "camera.json", "--out", "out"),
     "sky.png": ("render", "gaussians.ply", *CAMERA, "--background", "sky.png"),
@@ -268,6 +270,17 @@ def _zip_bomb(path: Path) -> None:
             array.write(bytes(1 << 20))
 
 
+def _sog_bomb(path: Path) -> None:
+    """Positions of 225 million pixels in 30 kB."""
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    stream = io.BytesIO()
+    Image.new("1", (15_000, 15_000)).save(stream, "PNG")
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in (files | {"means_l.webp": stream.getvalue()}).items():
+            archive.writestr(name, content)
+
+
 def _in_format(kind: str, mode: str, path: Path) -> None:
     image = Image.new("L" if mode in "IF" else "RGB", (WIDTH, HEIGHT), 90)
     image.convert(mode).save(path, kind)
@@ -304,6 +317,7 @@ SPECIAL = {
     "gaussians.ply": LISTS,
     "gaussians.spz": {"bomb": _gzip_bomb, "larger bomb": _valid_gzip_bomb},
     "gaussians.glb": {"deep": _deep_glb},
+    "gaussians.sog": {"image bomb": _sog_bomb, "zip bomb": _zip_bomb},
     "lego/transforms_train.json": DEEP,
     "photos/transforms.json": DEEP,
     "camera.json": DEEP,

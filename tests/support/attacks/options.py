@@ -19,7 +19,7 @@ from support.attacks.attack_folder import CAPTURE, SETTINGS
 
 FIT_OPTIONS = """
     fit.yml; --resume stopped; --data lego; --out out; --overwrite; --set seed=1; --threads 1;
-    --budget 0.01s
+    --budget 0.01s; --leave-out train/r_1
 """
 """Arguments of ``fit`` that are valid on their own."""
 

@@ -319,6 +319,7 @@ def test_unused_strategies_are_not_imported(monkeypatch):
         for name in names & set(sys.modules):
             monkeypatch.delitem(sys.modules, name)
         monkeypatch.setattr(extensions.STRATEGIES, "_extensions", {})  # private: not registered yet
-        density_strategy(FitConfig(data={"path": "."}, densify={"strategy": strategy}))
+        densify = {"strategy": strategy, "remove_floaters": False}
+        density_strategy(FitConfig(data={"path": "."}, densify=densify))
         imported = {name.rpartition(".")[2] for name in names & set(sys.modules)}
         assert imported == {strategy}

@@ -58,6 +58,19 @@ def assert_all_end(word):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
+def test_each_process_reads_its_photographs_from_disk(config, tmp_path):
+    """The report of several ranks those of the first process."""
+    path = config()
+    for size, in_memory in ((1, "true"), (2, "false")):
+        words = "--out", tmp_path / str(size), "--set", f"data.in_memory={in_memory}"
+        words += ("--set", "output.report=true")
+        status, _, errors = parallel_processes.run(size, command(path, *words))
+        assert status == 0, errors
+    assert result(tmp_path / "1") == result(tmp_path / "2")
+    assert (tmp_path / "2" / "report.html").is_file()
+
+
 SCENES = parallel_processes.REPOSITORY / "scenes"
 KNOT = SCENES / "shapes" / "knot.ply"
 

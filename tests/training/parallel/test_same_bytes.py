@@ -29,6 +29,7 @@ EFFECTS = {
     "data__random_background": True,
     "model__smoothing": True,
     "colors__lr": 0.02,
+    "colors__vignetting_lr": 0.02,
     "coarse": [{"until": 10, "factor": 2}],
 }
 LATE = {"optimizer__views": 8, "optimizer__views_from": 0.0, **STATIC}

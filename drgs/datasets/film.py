@@ -1,4 +1,4 @@
-"""Projection of world points to a view's image: a million start points in hundreds of views.
+"""Projection of world points to a view's image: a million points in hundreds of views.
 
 Matrix products are not used: their rounding depends on the number of threads.
 """
@@ -16,6 +16,10 @@ from drgs.core.arrays import from_host, types_of
 from drgs.datasets.types import Viewpoint
 
 Columns = Sequence[np.ndarray]  # coordinates x, y, z, each (N,)
+
+PIXEL_WIDTH, MAX_BEHIND = 1.5, 1.5
+"""Width of a pixel of the z-buffer, and largest distance behind its depth of shown points, in
+distances of the points. In smaller pixels, points are seen through gaps of a surface."""
 
 
 def is_projectable(view: Viewpoint) -> bool:
@@ -55,3 +59,28 @@ def to_film(view: Viewpoint, position: Columns) -> tuple[np.ndarray, np.ndarray,
     film, depth = lens.project_point(camera, point), dr.select(seen, depth, 0)
     dr.eval(film, depth)
     return film.x.numpy(), film.y.numpy(), depth.numpy()
+
+
+def shown_points(
+    view: Viewpoint, points: Columns, spacing: np.ndarray, pixel_width: float = PIXEL_WIDTH
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Return the points in the image that no clearly nearer point hides.
+
+    points: world; spacing: (N,) scene units, of each to its neighbours. Returned are their indices
+    (M,), the rows and columns of their pixels, and their depths (M,), scene units. pixel_width: of
+    the z-buffer, in ``spacing``. On a surface that turns away from the camera, points hide each
+    other.
+    """
+    u, v, depth = to_film(view, to_camera(view, points))
+    on_film = (depth > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
+    indices = np.flatnonzero(on_film)
+    u, v, depth, spacing = (values[indices] for values in (u, v, depth, spacing))
+    if len(indices):
+        pixel = max(1.0, pixel_width * view.fx * float(np.median(spacing / depth)))
+        place = np.floor(v / pixel).astype(np.int64) * (int(view.width / pixel) + 1)
+        place += np.floor(u / pixel).astype(np.int64)
+        nearest = np.full(place.max() + 1, np.inf)
+        np.minimum.at(nearest, place, depth)
+        shown = depth <= nearest[place] + MAX_BEHIND * spacing
+        indices, u, v, depth = (values[shown] for values in (indices, u, v, depth))
+    return indices, (v.astype(np.int64), u.astype(np.int64)), depth

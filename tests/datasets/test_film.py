@@ -8,7 +8,7 @@ from support.datasets import view_at
 from support.lens_scenes import LENSES, PINHOLE, kernel_lens
 from support.small_fits import reference_camera
 
-from drgs.initialization.film import to_camera, to_film
+from drgs.datasets.film import to_camera, to_film
 
 LENSES = {"pinhole": PINHOLE, **LENSES}
 

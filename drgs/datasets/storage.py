@@ -1,0 +1,159 @@
+"""Stores of photographs' pixels while a fit uses them: memory, or a disk.
+
+Photographs that would not fit into memory are on disk. An opaque one that is not scaled is decoded
+again from its own file at each use. What takes longer is written once to a temporary file, which
+the system removes with the process, however that ends.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import threading
+import weakref
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import psutil
+from typing_extensions import override
+
+from drgs.core.errors import UserError
+from drgs.core.files import refusal_reason
+from drgs.core.memory import format_bytes
+from drgs.datasets.types import LazyImage, Pixels, View
+
+Decode = Callable[[], np.ndarray]  # returns a photograph's pixels from its file
+
+FILE_SYSTEMS_IN_MEMORY = {"tmpfs", "ramfs"}
+
+LARGER_DISK = (
+    "set TMPDIR to a folder of a larger disk or a smaller data.image_size, or use fewer of them"
+)
+
+
+class MemoryStore:
+    """Keeps pixels in memory."""
+
+    is_on_disk = False
+
+    def keep(self, array: np.ndarray) -> Pixels:
+        """Return the array, or a lazy image that becomes the same one."""
+        return array
+
+    def keep_file(self, file: Path, pixels: np.ndarray, decode: Decode) -> Pixels:
+        """Return the pixels, or a lazy image that decodes their file again."""
+        del file, decode
+        return pixels
+
+
+class DiskStore(MemoryStore):
+    """Writes pixels to a temporary file of :func:`scratch_folder`, and reads them at each use."""
+
+    is_on_disk = True
+
+    def __init__(self, num_bytes: int, num_photographs: int) -> None:
+        """num_bytes: to be written.
+
+        Raises :class:`UserError` unless a disk has room for them.
+        """
+        self._folder, self._lock = scratch_folder(), threading.Lock()
+        try:
+            free = shutil.disk_usage(self._folder).free
+            if num_bytes > free:
+                raise UserError(
+                    f"{self._folder}: {num_photographs:,} photographs take "
+                    f"{format_bytes(num_bytes)} there during the fit, and {format_bytes(free)} are "
+                    f"free; {LARGER_DISK}"
+                )
+            self._file = tempfile.TemporaryFile(dir=self._folder, prefix="drgs")  # noqa: SIM115
+        except OSError as error:
+            raise self._error("cannot write photographs", error) from None
+        weakref.finalize(self, self._file.close)
+
+    def _error(self, what: str, error: OSError) -> UserError:
+        return UserError(f"{self._folder}: {what} (data.in_memory): {refusal_reason(error)}")
+
+    @override
+    def keep(self, array: np.ndarray) -> LazyImage:
+        """Write the array; several threads may."""
+        array = np.ascontiguousarray(array)
+        try:
+            with self._lock:
+                position = self._file.seek(0, os.SEEK_END)
+                self._file.write(array.data)
+                self._file.flush()
+        except OSError as error:
+            raise self._error("cannot write photographs", error) from None
+        read = partial(self._read, position, array.shape, array.dtype)
+        return LazyImage(array.shape, read, 0, is_on_disk=True)
+
+    def _read(self, position: int, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        array = np.empty(shape, dtype)
+        try:
+            with self._lock:
+                self._file.seek(position)
+                count = self._file.readinto(array.data.cast("B"))
+        except OSError as error:
+            raise self._error("cannot read photographs again", error) from None
+        if count != array.nbytes:
+            raise UserError(
+                f"{self._folder}: the temporary file of photographs was cut short during the fit; "
+                "continue it with --resume"
+            )
+        return array
+
+    @override
+    def keep_file(self, file: Path, pixels: np.ndarray, decode: Decode) -> LazyImage:
+        """Return an image that decodes the file again, which must stay as it is now."""
+        before = _status(file)
+
+        def decode_again() -> np.ndarray:
+            if (now := _status(file)) != before:
+                found = "it is gone" if now is None else "it has changed"
+                raise UserError(
+                    f"{file}: must stay as it is during a fit that reads it from disk "
+                    f"(data.in_memory), but {found}; put it back, and continue with --resume"
+                )
+            return decode()
+
+        return LazyImage(pixels.shape, decode_again, 0, is_on_disk=True)
+
+
+MEMORY = MemoryStore()
+
+
+def scratch_folder() -> Path:
+    """Return the folder of temporary files, or /var/tmp where that one is in memory.
+
+    Raises :class:`UserError` where both are.
+    """
+    folders = [Path(tempfile.gettempdir()), Path("/var/tmp")]
+    mounts = {Path(p.mountpoint): p.fstype for p in psutil.disk_partitions(all=True)}
+    for folder in folders:
+        place = folder.resolve()
+        if folder.is_dir() and not FILE_SYSTEMS_IN_MEMORY & {
+            next((mounts[above] for above in (place, *place.parents) if above in mounts), "")
+        }:
+            return folder
+    raise UserError(
+        f"{folders[0]}: is in memory, and photographs that do not fit there (data.in_memory) are "
+        "to be on a disk; set TMPDIR to a folder of one"
+    )
+
+
+def _status(file: Path) -> tuple[int, int] | None:
+    """Return size and time of a file, by which a change is noticed; None: there is none."""
+    try:
+        status = file.stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns
+
+
+def is_on_disk(view: View) -> bool:
+    """Return whether images of the view are read from disk at each use."""
+    images = (view.image, view.alpha, view.mask, view.depth)
+    return any(isinstance(image, LazyImage) and image.is_on_disk for image in images)

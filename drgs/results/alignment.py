@@ -1,0 +1,125 @@
+"""Differences between a photograph and a rendering that a camera explains: by registration.
+
+A rendering r of a camera that is slightly off, for a photograph of another exposure, differs from
+it to first order by
+
+    g_c r_c + (u + z x - w y) dr/dx + (v + z y + w x) dr/dy
+
+with gains g of the channels c, a shift (u, v), a zoom z and a rotation w about the middle of the
+image. :func:`align` finds the seven numbers by least squares, again after moving the rendering by
+them (Lucas and Kanade 1981), with weights by which pixels with other differences count little
+(Cauchy's, Holland and Welsch 1977).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from drgs.datasets.types import View
+
+SIGMA_PX = 1.0  # of the blur before the derivatives, so that they hold for shifts of a pixel
+NUM_MOVES, NUM_REWEIGHTINGS = 4, 4
+MIN_SIDE_PX = 8  # of an image; smaller ones are not aligned
+MIN_COVERED = 0.5  # share of the image; a rendering that is moved farther is not aligned
+MIN_DEVIATION = 1e-6  # of the remaining differences, display space
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A rendering's differences from its photograph."""
+
+    gains: np.ndarray  # (3,): the photograph's brightness relative to the rendering's, minus 1
+    shift: np.ndarray  # (2,) px: from the rendering's content to the photograph's
+    psnr: float  # dB, of the rendering without these differences
+
+
+def align(
+    view: View, rendering: np.ndarray, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> Alignment:
+    """Compare a rendering (H, W, 3), display space, with the view's photograph.
+
+    Masked pixels do not count, nor do those that the moved rendering does not cover. The background
+    behind a transparent photograph, display space, has no gain. Where the numbers do not make the
+    images more alike, and in images below 8 px, the differences are none.
+    """
+    photograph = np.asarray(view.image, np.float64)
+    height, width, _ = photograph.shape
+    counts = np.ones((height, width)) if view.mask is None else np.asarray(view.mask, np.float64)
+    behind = np.zeros(3)
+    if view.alpha is not None:
+        behind = (1 - np.asarray(view.alpha, np.float64)[..., None]) * np.array(background)
+    blur = SIGMA_PX, SIGMA_PX, 0
+    blurred = ndimage.gaussian_filter(photograph, blur)
+    image, moved, gains = np.asarray(rendering, np.float64), np.zeros(4), np.zeros(3)
+    before = _mean_error(photograph - image, counts)
+    for _ in range(NUM_MOVES if min(height, width) >= MIN_SIDE_PX else 0):
+        at, _ = _move(image, moved)
+        smooth = ndimage.gaussian_filter(at, blur)
+        base = ndimage.gaussian_filter(at - behind, blur)
+        directions = _directions(smooth, base)
+        numbers = _fit_numbers(directions, blurred - smooth, counts)
+        gains, moved = numbers[:3], moved + numbers[3:]
+    at, is_covered = _move(image, moved)
+    error = _mean_error(photograph - at - gains * (at - behind), counts * is_covered)
+    if is_covered.mean() < MIN_COVERED or not error < before:
+        gains, moved, error = np.zeros(3), np.zeros(4), before
+    return Alignment(gains, moved[:2], -10 * float(np.log10(max(error, 1e-10))))
+
+
+def _mean_error(difference: np.ndarray, counts: np.ndarray) -> float:
+    """Return the mean square of differences (H, W, 3); counts: weights (H, W)."""
+    squares = np.square(difference).mean(axis=2)
+    return float((squares * counts).sum() / max(counts.sum(), 1e-10))
+
+
+def _coordinates(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return x and y from the middle, (H, W), in units of half the diagonal."""
+    y, x = np.mgrid[:height, :width]
+    size = np.hypot(width, height) / 2
+    return (x + 0.5 - width / 2) / size, (y + 0.5 - height / 2) / size
+
+
+def _move(image: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the image (H, W, 3) at places moved by u, v, z and w, px, and whether it has them."""
+    height, width, _ = image.shape
+    rows, columns = np.indices((height, width))
+    if not moved.any():
+        return image, np.ones((height, width), bool)
+    x, y = _coordinates(height, width)
+    u, v, zoom, turn = moved
+    down, across = rows + v + zoom * y + turn * x, columns + u + zoom * x - turn * y
+    planes = [
+        ndimage.map_coordinates(plane, [down, across], order=3, mode="nearest")
+        for plane in np.moveaxis(image, 2, 0)
+    ]
+    is_there = (np.abs(down - (height - 1) / 2) < height / 2) & (
+        np.abs(across - (width - 1) / 2) < width / 2
+    )
+    return np.stack(planes, axis=2), is_there
+
+
+def _directions(image: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """Return the derivatives of an image (H, W, 3) along the numbers, (H, W, 3, 7)."""
+    x, y = _coordinates(*image.shape[:2])
+    x, y = x[..., None], y[..., None]
+    dy, dx = np.gradient(image, axis=(0, 1))
+    gains = base[..., None] * np.eye(image.shape[2])
+    others = np.stack([dx, dy, x * dx + y * dy, x * dy - y * dx], axis=-1)
+    return np.concatenate([gains, others], axis=-1)
+
+
+def _fit_numbers(directions: np.ndarray, difference: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the numbers (7,) of the robust regression; counts: weights (H, W)."""
+    a = directions.reshape(-1, directions.shape[-1])
+    b, given = difference.ravel(), np.repeat(counts.ravel(), difference.shape[-1])
+    weights, numbers = given, np.zeros(a.shape[1])
+    for _ in range(NUM_REWEIGHTINGS):
+        normal = (a * weights[:, None]).T @ a + 1e-9 * np.eye(a.shape[1])
+        numbers = np.linalg.solve(normal, a.T @ (weights * b))
+        left = np.abs(b - a @ numbers)
+        deviation = 1.4826 * np.median(left[given > 0]) if given.any() else 0.0
+        weights = given / (1 + np.square(left / (2 * deviation + MIN_DEVIATION)))
+    return numbers

@@ -1,0 +1,100 @@
+"""Training photographs ranked by how badly a fit matches them, with a hint at the cause."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drgs.datasets.images import downscale, smaller_view, with_arrays
+from drgs.datasets.types import LazyImage, View
+from drgs.results.alignment import align
+from drgs.results.metrics import map_ahead, psnr
+
+WIDTH_PX = 135  # about: of photographs and renderings that are registered and shown
+NUM_HINTS = 6  # the worst photographs, which get a hint
+
+Render = Callable[[tuple[View, ...]], Iterable[np.ndarray]]
+"""Yields images (H, W, 3) of views as fitted, display space."""
+
+MIN_GAIN, MIN_SHIFT_PX = 0.1, 0.5
+"""Differences of brightness, and shifts of small images, that are worth a hint."""
+
+MAX_SHARPNESS = 0.85  # of a blurred photograph: its mean step, relative to the rendering's
+OUTLIER_DEVIATIONS = 3.0  # below the median, in normal deviations by the median one
+NORMAL = 1.4826  # standard deviation over the median absolute one, of a normal distribution
+
+
+@dataclass(frozen=True, eq=False)
+class RankedPhotograph:
+    """A training photograph beside the rendering of its view."""
+
+    name: str
+    psnr: float  # dB
+    hint: str = ""  # at the cause of the difference
+    images: np.ndarray | None = None  # (H, 2 W, 3) display space, small: photograph, rendering
+
+
+def rank_photographs(
+    views: Sequence[View], render: Render, background: tuple[float, float, float]
+) -> list[RankedPhotograph]:
+    """Return the training photographs, worst first; the first few have hints and images.
+
+    Photographs that other processes have are left out. render: without what a fit optimises for
+    each photograph, such as colours.
+    """
+    views = [v for v in views if not (isinstance(v.image, LazyImage) and v.image.is_elsewhere)]
+    if not views:
+        return []
+    scores = list(map_ahead(_measure, zip(views, render(tuple(views)), strict=True)))
+    order = sorted(range(len(views)), key=lambda index: scores[index])
+    ranked = [RankedPhotograph(views[index].name, scores[index]) for index in order]
+    limit, worst = _outlier_limit(scores), tuple(views[index] for index in order[:NUM_HINTS])
+    for place, (view, image) in enumerate(zip(worst, render(worst), strict=True)):
+        factor = max(1, round(view.width / WIDTH_PX))
+        small = with_arrays(smaller_view(view, factor))
+        image = downscale(image, small.width)
+        hint = _hint_at(small, image, factor, background, ranked[place].psnr < limit)
+        images = np.concatenate([np.asarray(small.image), image], axis=1)
+        ranked[place] = replace(ranked[place], hint=hint, images=images)
+    return ranked
+
+
+def _measure(view: View, image: np.ndarray) -> float:
+    return psnr(image, np.asarray(view.image), view.mask)
+
+
+def _outlier_limit(scores: Sequence[float]) -> float:
+    """Return the PSNR below which a photograph is far from the others, dB."""
+    median = np.median(scores)
+    deviation = NORMAL * np.median(np.abs(np.array(scores) - median))
+    return float(median - OUTLIER_DEVIATIONS * deviation)
+
+
+def _hint_at(
+    view: View,
+    image: np.ndarray,
+    factor: int,
+    background: tuple[float, float, float],
+    is_outlier: bool,
+) -> str:
+    """Return how a photograph differs from its rendering; "": as others do."""
+    found = align(view, image, background)
+    hints = []
+    if np.abs(found.gains).max() > MIN_GAIN:
+        gains = ", ".join(f"{gain:+.0%}" for gain in found.gains)
+        hints.append(f"exposure or white balance (red, green, blue {gains})")
+    if (shift := float(np.hypot(*found.shift))) > MIN_SHIFT_PX:
+        hints.append(f"pose (off by {shift * factor:.1f} px)")
+    if _mean_step(np.asarray(view.image)) < MAX_SHARPNESS * _mean_step(image):
+        hints.append("blurred")
+    if not hints and is_outlier:
+        hints.append("something moved, or is seen here alone")
+    return "; ".join(hints)
+
+
+def _mean_step(image: np.ndarray) -> float:
+    """Return the mean absolute difference of neighbouring pixels."""
+    steps = [np.abs(np.diff(image, axis=axis)).ravel() for axis in (0, 1)]
+    return float(np.concatenate(steps, dtype=np.float64).sum() / max(1, image.size))

@@ -1,0 +1,159 @@
+"""Depths of views from meshes and point clouds, against rays and triangles in numpy."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+from support.datasets import dataset_of, view_at, write_points
+from support.lens_scenes import LENSES, PINHOLE, kernel_lens, points_at
+from support.small_capture import make_dataset, write_dataset
+from support.small_fits import reference_camera
+
+from drgs.config.load import config_from
+from drgs.core.errors import UserError
+from drgs.datasets import load_dataset
+from drgs.datasets.surface_depths import with_depths_from
+from drgs.datasets.types import CameraMotion, all_views
+
+LENSES = {"pinhole": PINHOLE, **LENSES}
+
+
+def write_mesh(path, vertices, faces, corners=3):
+    vertex = np.array([tuple(v) for v in vertices], [(axis, "f4") for axis in "xyz"])
+    face = np.empty(len(faces), [("vertex_indices", "i4", (corners,))])
+    face["vertex_indices"] = faces
+    PlyData([PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]).write(path)
+    return path
+
+
+def soup(count=60, seed=0):
+    """Random triangles (N, 3, 3) around the origin, in single precision."""
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-1.2, 1.2, (count, 1, 3)) + rng.normal(0, 0.5, (count, 3, 3))
+    return corners.astype(np.float32).astype(np.float64)
+
+
+def first_hits(origin, directions, triangles):
+    """(R, T) distances along rays, in lengths of ``directions``, and the least barycentric.
+
+    By Cramer's rule: o + t d = a + u (b - a) + v (c - a). Missed triangles are at infinity.
+    """
+    a, edges = triangles[:, 0], triangles[:, 1:] - triangles[:, :1]
+    matrices = np.stack(
+        np.broadcast_arrays(-directions[:, None], edges[None, :, 0], edges[None, :, 1]), axis=-1
+    )
+    t, u, v = np.moveaxis(np.linalg.solve(matrices, (origin - a)[None, :, :, None])[..., 0], -1, 0)
+    least = np.minimum(np.minimum(u, v), 1 - u - v)
+    return np.where((least >= 0) & (t > 0), t, np.inf), least
+
+
+def lens_view(name):
+    lens = LENSES[name]
+    host = None if lens is PINHOLE else kernel_lens(lens)
+    return lens, replace(view_at((3, -2, 1), (0.25, 0, 0)), lens=host, fy=35.0, cx=17.0)
+
+
+def depth_from(path, *views):
+    return [view.depth for view in with_depths_from(path, dataset_of(views), all_views).train]
+
+
+@pytest.mark.parametrize("name", ["pinhole", "rational", "fisheye", "thin prism"])
+def test_depths_of_a_mesh_are_where_rays_meet_triangles(tmp_path, name):
+    lens, view = lens_view(name)
+    triangles, camera = soup(), reference_camera(view, near=1e-9)
+    path = write_mesh(tmp_path / "a.ply", triangles.reshape(-1, 3), np.arange(180).reshape(-1, 3))
+    (depth,) = depth_from(path, view)
+    assert depth.shape == (30, 40) and depth.dtype == np.float32
+    row, column = np.indices(depth.shape).reshape(2, -1)
+    rays = points_at(lens, camera, np.stack([column, row], axis=1) + 0.5, np.ones(len(row)))
+    is_ray = np.isfinite(rays).all(axis=1)
+    rays = np.where(is_ray[:, None], rays, [0, 0, 1])
+    distances, least = first_hits(view.center, rays @ view.camera_to_world[:3, :3].T, triangles)
+    nearest = distances.min(axis=1)
+    met = is_ray & np.isfinite(nearest)
+    points = rays * np.where(met, nearest, 1)[:, None]
+    expected = np.where(met, lens.depths(camera, points), 0)
+    clear = np.abs(least).min(axis=1) > 1e-4  # rays that pass an edge are decided by rounding
+    assert 200 < met[clear].sum() < 1000 and clear.mean() > 0.9
+    np.testing.assert_allclose(depth.ravel()[clear], expected[clear], rtol=1e-5)
+
+
+def test_points_give_depths_where_nothing_hides_them(tmp_path):
+    """Cameras see the nearer one of two parallel walls of points, on its own pixels."""
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-0.6, 0.6, 61)] * 2))
+    near, far = (np.column_stack([x, y, np.full(x.size, z)]) for z in (0.5, -0.5))
+    path = tmp_path / "points.ply"
+    write_points(path, np.concatenate([near, far]), np.zeros((2 * x.size, 3)))
+    view = replace(view_at((0.1, 0, 3), (0.1, 0.001, 0)), width=60, height=60)
+    (depth,) = depth_from(path, view)
+    position = (near - view.center) @ view.camera_to_world[:3, :3]
+    places = np.floor(view.fx * position[:, :2] / position[:, 2:] + [view.cx, view.cy]).astype(int)
+    on_film = ((places >= 0) & (places < 60)).all(axis=1)
+    expected = np.zeros((60, 60))
+    for (column, row), z in zip(places[on_film], position[on_film, 2], strict=True):
+        expected[row, column] = min(z, expected[row, column] or np.inf)
+    np.testing.assert_allclose(depth, expected, rtol=1e-6)
+    assert (depth > 0).sum() > 300
+
+
+def test_moving_cameras_get_none_and_the_data_its_own_origin(tmp_path):
+    view = view_at((3, 0, 0), (0, 0, 0))
+    moving = replace(view, motion=CameraMotion(view.camera_to_world, "global"), depth=np.ones(1))
+    path = write_mesh(tmp_path / "a.ply", 4 * soup(8).reshape(-1, 3), np.arange(24).reshape(-1, 3))
+    first, second = depth_from(path, view, moving)
+    assert first.any() and second is None
+    shifted = dataset_of([view]).relative_to((0.5, -0.25, 1.0))
+    found = with_depths_from(path, shifted, all_views)
+    np.testing.assert_allclose(found.train[0].depth, first, rtol=1e-4)
+    assert found.description == "; depth of 1 of 1 training views from the mesh of a.ply"
+    assert found.train[0].files == {"depth": path}
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    write_dataset(tmp_path / "data", make_dataset(train=3, test=1))
+    return tmp_path
+
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+
+REFUSED = {
+    "missing": "{path}: cannot read the file: No such file or directory",
+    "text": "{path}: not a valid PLY file: the header must end with end_header",
+    "quads": "data.depth_from: {path}: must be triangles, and complete: ",
+    "index": "data.depth_from: {path}: faces must name vertices 0 to 3, got 4",
+    "cut": "data.depth_from: {path}: must be triangles, and complete: ",
+    "nan": "{path}: element vertex, row 0: x must be finite, got nan",
+    "few": "data.depth_from: {path}: at least 4 points, got 3",
+    "elsewhere": "data.depth_from: {path}: no training camera that stands still sees the mesh",
+    "points elsewhere": "data.depth_from: {path}: no training camera that stands still sees the po",
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_files_that_give_no_depth_are_refused(photographs, case):
+    path = photographs / "a.ply"
+    if case == "text":
+        path.write_text("no mesh")
+    elif case in ("few", "points elsewhere"):
+        points = CORNERS[:3] if case == "few" else CORNERS + 1000
+        write_points(path, points, np.zeros((len(points), 3)))
+    elif case != "missing":
+        faces = {"index": [[0, 1, 4]], "quads": [[0, 1, 2, 3]]}
+        vertices = CORNERS + (1000 if case == "elsewhere" else 0)
+        vertices[0] = np.nan if case == "nan" else vertices[0]
+        given = faces.get(case, [[0, 1, 2]])
+        write_mesh(path, vertices, given, corners=len(given[0]))
+        if case == "cut":
+            path.write_bytes(path.read_bytes()[:-4])
+    with pytest.raises(UserError) as refusal:
+        load_dataset(photographs / "data", depth_from=path)
+    assert str(refusal.value).startswith(REFUSED[case].format(path=path)), refusal.value
+
+
+@pytest.mark.parametrize("other", [{"loss": {"depth_weight": 0}}, {"data": {"ignore_depth": True}}])
+def test_depth_that_nothing_uses_is_refused(other):
+    data = {"path": "data", "depth_from": "a.ply", **other.get("data", {})}
+    with pytest.raises(UserError, match=r"data\.depth_from must be null without loss\.depth_weigh"):
+        config_from({"data": data, **{k: v for k, v in other.items() if k != "data"}}, "test")
