@@ -267,7 +267,7 @@ def test_measurement_matches_its_columns(subject):
     """Masked pixels of a photograph are left out."""
     accurate = [accuracy.most_accurate(subject, c, accuracy.MIN_ALPHA) for c in subject.cameras]
     rungs = [accuracy.RUNGS[0], accuracy.Rung("4 samples", {"low_pass": 0.0}, False, samples=4)]
-    default, sampled = accuracy.measure(subject, accurate, rungs, 1)
+    default, sampled = accuracy.measure(subject, accurate, rungs, 3)  # medians
     image = image_of(subject)
     reference_image = reference_rays.render(
         reference_gaussians(subject.gaussians), subject.cameras[0], (1, 1, 1)
