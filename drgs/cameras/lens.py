@@ -71,7 +71,7 @@ class Lens:
     distorts: ClassVar[bool] = True  # whether a pinhole could take its place
     parallel: ClassVar[bool] = False  # whether its rays are, instead of meeting in the camera
     whole_turn: ClassVar[bool] = False
-    """Whether the whole film is a turn about the vertical axis. Its left side then continues at the
+    """True if the whole film is a turn about the vertical axis. Its left side then continues at the
     right one, and the camera's focal lengths and principal point are not used."""
     groups: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Names of coefficients by field, a tuple of the first of them; none: a field is a coefficient.

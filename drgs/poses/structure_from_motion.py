@@ -304,6 +304,7 @@ class _Reconstruction:
             reader.camera_model = self.settings.camera_model
             if masks is not None:
                 reader.mask_path = masks
+            self.watch("photograph", done, len(self.names))
             # In this order: threads would number the photographs in the order of their ends.
             pycolmap.import_images(
                 self.database,
