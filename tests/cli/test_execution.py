@@ -13,10 +13,10 @@ from support.fit_command import assert_fits, run_fit, without_images, write_proj
 from support.folders import visible
 from support.small_capture import blobs
 
-from drgs import render
 from drgs.cli.execution import execution_settings
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
+from drgs.render import __main__ as render
 from drgs.training.trainer import Trainer
 
 DEBUG = dr.JitFlag.Debug

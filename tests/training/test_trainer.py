@@ -9,7 +9,7 @@ from support import small_fits as fits
 from support.small_fits import kernel_hashes, steps
 from support.trainers import make_trainer
 
-from drgs.training import memory
+from drgs.fit import memory
 from drgs.training.losses import TARGET_BYTES
 from drgs.training.steps import bytes_per_pixel
 
