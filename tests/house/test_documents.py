@@ -98,7 +98,7 @@ def test_readme_leads_to_every_page():
 # ----------------------------------------------------------------------------------------------
 
 
-FOLDERS = ("drgs", "plugins", "scenes", "tests", "docs")
+FOLDERS = ("drgs", "plugins", "scenes", "examples", "tests", "docs")
 
 
 @each_page
@@ -211,10 +211,10 @@ def test_documents_show_every_command():
 # ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("example", sorted((REPOSITORY / "tests" / "examples").glob("*.py")))
+@pytest.mark.parametrize("example", sorted((REPOSITORY / "examples").glob("*.py")))
 def test_documents_contain_the_examples_of_extensions(example):
     program, page = example.read_text(), text_of("docs/developing.md")
-    included = f"```{{literalinclude}} ../tests/examples/{example.name}\n```"
+    included = f"```{{literalinclude}} ../examples/{example.name}\n```"
     assert f"```python\n{program}```" in page or included in page
     assert 20 <= len(program.splitlines()) <= 60
 

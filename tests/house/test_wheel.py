@@ -210,7 +210,7 @@ def photographs(tmp_path):
 def test_external_package_can_use_every_extension_point(scripts, photographs):
     """A strategy, effect, loss, term, lens, falloff, file format and reader; no file of drgs."""
     folder = photographs
-    source = shutil.copytree(REPOSITORY / "tests" / "examples", folder / "source")
+    source = shutil.copytree(REPOSITORY / "examples", folder / "source")
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input")
     offline = ("--quiet", "--no-deps", "--no-index")
     run(*pip, "wheel", *offline, "--no-build-isolation", "-w", folder, source, cwd=folder)

@@ -13,12 +13,12 @@ from unittest import mock
 
 from drgs.core import registry
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
 @contextmanager
 def installed_examples(*names: str) -> Iterator[dict[str, ModuleType]]:
-    """Within the block, entry points name these modules of ``examples``; yields the modules."""
+    """Within the block, entry points name these modules of ``examples/``; yields the modules."""
     points = [EntryPoint(name, name, registry.ENTRY_POINT_GROUP) for name in names]
     with (
         mock.patch.object(sys, "path", [str(EXAMPLES), *sys.path]),
