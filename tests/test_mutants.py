@@ -24,6 +24,7 @@ from support import loss_checks, special_checks
 from support.cases import CASES
 from support.detectors import Detector, Outcome, find_noticed
 from support.instrumented import Instrumented
+from support.kernels import kernels_of
 from support.mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Switchboard
 
 from drgs.accuracy import exact, pixel_order, ray_colors
@@ -442,10 +443,7 @@ def test_mutants_compile_no_kernel():
     arguments = [dr.opaque(Float64, value, 4) for value in (2, 3, 5)]
 
     def kernels():
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            dr.eval(adjoint(*arguments))
-            return [kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])]
+        return kernels_of(lambda: dr.eval(adjoint(*arguments)))
 
     first = kernels()
     assert first

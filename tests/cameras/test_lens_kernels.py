@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 
-import drjit as dr
 import numpy as np
 import pytest
 from support.helpers import (
@@ -14,12 +13,11 @@ from support.helpers import (
     clear,
     device_gaussians,
     frame_adjoint,
-    frame_tangent,
     plane_cotangents,
     render_composed,
     rows,
 )
-from support.kernels import drain_kernels
+from support.kernels import kernels_of_a_frame
 from support.lens_scenes import FORMS, LENSES, LensCase, case_of, kernel_lens
 
 from drgs.accuracy.pipeline import pipeline_of
@@ -32,7 +30,6 @@ from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import effects
 from drgs.reference.effects import OpenCV
 from drgs.reference.effects import ThinPrismFisheye as ThinPrism
-from drgs.splatting import rendering
 from drgs.splatting.projection import ewa
 
 # ----------------------------------------------------------------------------------------------
@@ -110,23 +107,8 @@ def kernels_of(lens, camera_seed=0) -> dict[str, list]:
     """[hash, operation count] of the kernels of a frame, its adjoint, and its tangent."""
     # Few enough entries that Dr.Jit's running maximum needs one pass.
     case = LensCase("kernels", 37, 29, 1, 20, seed=camera_seed, lens=lens)
-    gaussians, camera = device_gaussians(case.gaussians, FLOAT32), case.device_camera(FLOAT32)
-    # Aligned as Dr.Jit's own memory: see test_composition.
-    flat = gaussians.logit_opacities + dr.opaque(FLOAT32.Float, 0)
-    gaussians = replace(gaussians, logit_opacities=flat)
-    ones = dr.opaque(FLOAT32.Float, 1, case.width * case.height)
-    dr.eval(gaussians, ones)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history()
-        # The pipeline of the other tests, for the same kernels.
-        frame = rendering.render(gaussians, camera, case.pipeline)
-        dr.eval(frame.planes())
-        forward = drain_kernels()
-        frame_adjoint(gaussians, frame, [ones] * (len(frame.planes()) - 1), ones)
-        adjoint = drain_kernels()
-        dr.eval(frame_tangent(gaussians, frame, gaussians))
-        tangent = drain_kernels()
-    return {"forward": forward, "adjoint": adjoint, "tangent": tangent}
+    # The pipeline of the other tests, for the same kernels.
+    return kernels_of_a_frame(case.pipeline, case, case.device_camera(FLOAT32))
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 from conftest import REPOSITORY
 from drjit.llvm.ad import Float, UInt32
+from support.kernels import launched
 
 from drgs.core import private
 
@@ -80,10 +81,7 @@ def test_llvm_version_is_known():
 
 def vector_width() -> int:
     """Read the number of 32-bit numbers in a vector from the code that Dr.Jit generates."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        dr.eval(dr.arange(Float, 64) * dr.opaque(Float, 2))
-        (kernel,) = dr.kernel_history([dr.KernelType.JIT])
+    (kernel,) = launched(lambda: dr.eval(dr.arange(Float, 64) * dr.opaque(Float, 2)))
     return int(re.search(r"<(\d+) x float>", kernel["ir"].getvalue())[1])
 
 

@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from support.kernels import kernel_hashes
 from support.lit_scenes import FAR_AWAY, camera, gaussians, scene_of
 
 import drgs  # noqa: F401  (registers the plugins)
@@ -330,10 +331,7 @@ def test_camera_motion_needs_no_new_kernels():
         step = mi.Transform4f().translate(mi.Point3f(dr.opaque(mi.Float, 0.05), 0, 0))
         params["sensor.to_world"] = step @ params["sensor.to_world"]
         params.update()
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            dr.eval(mi.render(found))
-            kernels.append({kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])})
+        kernels.append(kernel_hashes(lambda: dr.eval(mi.render(found))))
     assert kernels[2] == kernels[1]
 
 

@@ -226,14 +226,6 @@ def assert_resumes_to_the_same_bytes(make: Callable[[], Trainer], before: int, a
     assert any(begun[name] != value for name, value in expected.items())
 
 
-def kernel_hashes(act: Callable[[], object]) -> set:
-    """Return hashes of the kernels that ``act`` launches."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        act()
-        return {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
-
-
 def end_view(effect: TrainingEffect, trainer: Trainer, view) -> None:
     """Let an effect take its step, as the trainer does."""
     derivatives = {name: dr.grad(leaf) for name, leaf in effect.leaves(view).items()}
