@@ -18,7 +18,7 @@ from drgs.reference.effects import (
 )
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES
-from support.motion_checks import rolling_image
+from support.rolling_shutter import rolling_image
 from support.views import VIEWS, Scene, View, pose, splats_before
 
 WINDOW = (13, 7, 29, 18)
@@ -89,17 +89,12 @@ class Calibrated:
     def camera_at(self, time: float) -> reference.Camera:
         return effects.camera_at(self.camera, self.close_camera, time)
 
-    # What rolling_image expects of a case
-    width = property(lambda self: self.camera.width)
-    height = property(lambda self: self.camera.height)
-    rendered_degree, background = 1, (0.0, 0.0, 0.0)
-
     def rendered(self, gaussians) -> reference.RenderedImage:
         """The whole film by the reference, on black; motion with SHUTTER_SAMPLES."""
         if self.close is None:
             return effects.render(gaussians, self.camera, self.lens, threshold_width=NEAR_THRESHOLD)
         if self.shutter == "rolling":
-            return rolling_image(self, gaussians, NEAR_THRESHOLD)
+            return rolling_image(gaussians, self.camera_at, self.lens, 1, NEAR_THRESHOLD)
         return effects.render_motion_blur(
             gaussians, self.camera, self.close_camera, SHUTTER_SAMPLES, np.zeros(3), self.lens,
             NEAR_THRESHOLD,

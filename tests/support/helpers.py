@@ -98,19 +98,36 @@ def _random_camera(rng, width, height) -> reference.Camera:
     )
 
 
-def gaussians_on_film(rng, camera, film, z, sizes, logits, degree) -> reference.Gaussians:
-    """Gaussians at film positions (N, 2) px and depths z (N,), of ``sizes`` (N, 3) px."""
-    slopes = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    points = np.column_stack([slopes * z[:, None], z])
-    n = len(z)
+def gaussians_before(
+    rng, camera, points, scales, logits, degree, quats=None, sh_size=0.3
+) -> reference.Gaussians:
+    """Gaussians at points (N, 3) in camera axes, of ``scales`` (N, 3) in scene units.
+
+    quats: (N, 4); None: random ones, of norms from 0.2 to 5.
+    """
+    n = len(points)
+    if quats is None:
+        quats = rng.normal(0, 1, (n, 4)) * rng.uniform(0.2, 5.0, (n, 1))
     return reference.Gaussians(
         means=single(points @ camera.rotation + camera.center),
-        quats=single(rng.normal(0, 1, (n, 4)) * rng.uniform(0.2, 5.0, (n, 1))),
-        log_scales=single(np.log(sizes * np.abs(z)[:, None] / camera.fx)),
+        quats=single(quats),
+        log_scales=single(np.log(scales)),
         logit_opacities=single(logits),
         sh0=single(rng.normal(0, 1.0, (n, 1, 3))),
-        shN=single(rng.normal(0, 0.3, (n, (degree + 1) ** 2 - 1, 3))),
+        shN=single(rng.normal(0, sh_size, (n, (degree + 1) ** 2 - 1, 3))),
     )
+
+
+def points_on_film(camera, film, z) -> np.ndarray:
+    """Points (N, 3) in camera axes that a pinhole shows at ``film`` (N, 2) px, at depths z (N,)."""
+    slopes = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    return np.column_stack([slopes * z[:, None], z])
+
+
+def gaussians_on_film(rng, camera, film, z, sizes, logits, degree) -> reference.Gaussians:
+    """Gaussians at film positions (N, 2) px and depths z (N,), of ``sizes`` (N, 3) px."""
+    scales = sizes * np.abs(z)[:, None] / camera.fx
+    return gaussians_before(rng, camera, points_on_film(camera, film, z), scales, logits, degree)
 
 
 def scattered(rng, camera, degree, count) -> reference.Gaussians:
