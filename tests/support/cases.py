@@ -267,6 +267,8 @@ def with_lens(name, effect="lens", reference_of=by_effects, **options) -> Case:
     options.setdefault("focal", FOCAL.get(type(lens), 26.0))
     if isinstance(lens, effects.Equirectangular):
         options.setdefault("scene", all_around)
+    if (effect, name) == ("rolling shutter", "panorama"):
+        reference_of = None  # a mean may be in several rows: which one shows it is open
     found = reference_of and partial(reference_of, lens=lens)
     return Case(f"{effect}, {name}", kernel_lens(lens), reference=found, **options)
 
@@ -309,7 +311,7 @@ EFFECTS = {
     "thin lens": (by_effects, {"aperture": (0.0625, 2.0)}),
     "smoothing": (by_effects, {"smoothing": 0.0625}),
     "motion blur": (by_motion, {"shutter": shutter(MotionBlur, MOTION_SAMPLES)}),
-    "rolling shutter": (by_rows, {"shutter": shutter(RollingShutter)}),
+    "rolling shutter": (by_rows, {"shutter": shutter(RollingShutter), "count": 20}),
     **{name: (None, {"approximations": APPROXIMATIONS[name], **STEP}) for name in OF_LENSES},
 }
 

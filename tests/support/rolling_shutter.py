@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import numpy as np
 from scipy.optimize import brentq
 
-from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import effects
 from drgs.reference import splatting as reference
 
@@ -27,10 +28,12 @@ def rolling_image(gaussians, camera_at, lens, degree, threshold_width) -> refere
     """Each splat as a whole at the time of its mean, on black; camera_at: the camera at a time."""
     cameras = [camera_at(row_time(camera_at, lens, mean)) for mean in gaussians.means]
     pairs = [
-        (reference.Gaussians(**{n: getattr(gaussians, n)[k : k + 1] for n in PARAMETER_NAMES}), c)
-        for k, c in enumerate(cameras)
+        (reference.Gaussians(*(values[k : k + 1] for values in vars(gaussians).values())), camera)
+        for k, camera in enumerate(cameras)
     ]
-    splats = [effects.project(*pair, lens) for pair in pairs]
+    bounds = lens.slope_bounds(cameras[0])  # wherever the camera is, and slow to compute
+    with mock.patch.object(type(lens), "slope_bounds", lambda *_: bounds):
+        splats = [effects.project(*pair, lens) for pair in pairs]
     colors = np.concatenate([effects.sh_colors(*pair, lens, degree) for pair in pairs])
     means2d, conics, opacities, depths, visible = (
         np.concatenate([getattr(each, name) for each in splats])
