@@ -9,6 +9,7 @@ import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
 import pytest
+from hypothesis import Phase, settings
 
 from drgs.bench import scenes
 from drgs.cameras.camera import Camera
@@ -62,6 +63,16 @@ FLOAT64 = Precision(
 both_precisions = pytest.mark.parametrize(
     "precision", [FLOAT64, FLOAT32], ids=["float64", "float32"]
 )
+
+
+examples = settings(
+    derandomize=True,
+    database=None,
+    deadline=None,
+    max_examples=25,
+    phases=[Phase.generate, Phase.shrink],
+)
+"""Settings of Hypothesis: the same examples in every run."""
 
 
 def rows(vectors) -> np.ndarray:
@@ -260,9 +271,11 @@ def render_composed(gaussians, camera, pipeline):
 
 
 def device_gaussians(gaussians: reference.Gaussians, precision: Precision) -> Gaussians:
-    """The same Gaussians as Dr.Jit tensors."""
+    """The same Gaussians as Dr.Jit arrays, in its own memory: how numpy's is aligned is a part of
+    kernels."""
     fields = {name: getattr(gaussians, name) for name in PARAMETER_NAMES}
-    return Gaussians(**fields).to(precision.TensorXf)
+    device = Gaussians(**fields).to(precision.TensorXf)
+    return replace(device, logit_opacities=precision.array(gaussians.logit_opacities))
 
 
 def reference_gaussians(gaussians: Gaussians) -> reference.Gaussians:
@@ -302,12 +315,16 @@ def as_images(planes, camera) -> dict[str, np.ndarray]:
     }
 
 
-def image_planes(frame, case) -> dict[str, np.ndarray]:
-    """Return a frame with colour and depth as the fields of ``reference.RenderedImage``."""
-    images = as_images(frame.planes(), case.camera)
+def image_planes(frame, case=None) -> dict[str, np.ndarray]:
+    """Return a frame with colour and depth as the fields of ``reference.RenderedImage``.
+
+    case: on its background; None: on black.
+    """
+    images = as_images(frame.planes(), frame.camera)
     transmittance = images["transmittance"]
+    background = np.zeros(3) if case is None else case.background
     return {
-        "image": images["color"] + transmittance[..., None] * case.background,
+        "image": images["color"] + transmittance[..., None] * background,
         "alpha": 1 - transmittance,
         "depth": images["depth"],
         "transmittance": transmittance,

@@ -2,10 +2,8 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 
 import drjit as dr
-import drjit.llvm.ad as llvm
 import numpy as np
 
 from drgs.splatting import rendering
@@ -42,10 +40,6 @@ def kernels_of_a_frame(pipeline, case=None, camera=None) -> dict[str, list]:
     case = case or Case("composition", 37, 29, 3)
     gaussians = device_gaussians(case.gaussians, FLOAT32)
     camera = camera or device_camera(case.camera, FLOAT32)
-    # A flat array made of a numpy array shares its memory, and whether that is aligned to 64
-    # bytes is up to chance and part of a kernel: let Dr.Jit store it.
-    flat = gaussians.logit_opacities + dr.opaque(llvm.Float, 0)
-    gaussians = replace(gaussians, logit_opacities=flat)
     ones = FLOAT32.array(np.ones(case.width * case.height))
     dr.eval(gaussians, camera, ones)
     frames = []
