@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from conftest import REPOSITORY, copy_checkout
 from PIL import Image
 from support.small_capture import blobs, make_dataset
 
@@ -57,25 +57,31 @@ def run(*command, cwd):
     return result.stdout
 
 
+PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input")
+OFFLINE = ("--quiet", "--no-deps", "--no-index")
+
+
+def build_wheel(source, folder):
+    """Return the wheel of a package, in a folder without others."""
+    run(*PIP, "wheel", *OFFLINE, "--no-build-isolation", "-w", folder, source, cwd=folder)
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+def install(wheel, python):
+    """Install a wheel for another interpreter."""
+    run(*PIP, "--python", python, "install", *OFFLINE, wheel, cwd=wheel.parent)
+
+
 @pytest.fixture(scope="module")
 def scripts(tmp_path_factory):
     """Folder of the scripts of a new virtual environment with the wheel in it."""
     folder = tmp_path_factory.mktemp("wheel")
-    source = folder / "source"
-    source.mkdir()
-    for name in ("drgs", "plugins"):
-        ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(REPOSITORY / name, source / name, ignore=ignored)
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(REPOSITORY / name, source / name)
-    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input")
-    offline = ("--quiet", "--no-deps", "--no-index")
-    run(*pip, "wheel", *offline, "--no-build-isolation", "-w", folder, source, cwd=folder)
-    (wheel,) = folder.glob("drgs-*.whl")
+    wheel = build_wheel(copy_checkout(folder / "source"), folder)
     run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder)
     scripts = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
     python = scripts / f"python{sysconfig.get_config_var('EXE') or ''}"
-    run(*pip, "--python", python, "install", *offline, wheel, cwd=folder)
+    install(wheel, python)
     # The dependencies are this environment's, and come last. Its own .pth files, such as that of
     # an editable drgs, are not read there.
     where = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder)
@@ -88,22 +94,6 @@ def scripts(tmp_path_factory):
 def model(tmp_path):
     blobs().save(tmp_path / "model.ply")
     return tmp_path / "model.ply"
-
-
-def files_of(package):
-    """Paths of a package's files, without what Python compiles."""
-    found = (path.relative_to(package) for path in package.rglob("*") if path.is_file())
-    return {path for path in found if "__pycache__" not in path.parts}
-
-
-def test_installed_package_contains_every_file(scripts, tmp_path):
-    program = "import drgs, drgs.plugins; print(drgs.__file__, drgs.plugins.__file__, sep='\\n')"
-    shown = run(scripts / "python", "-c", program, cwd=tmp_path).splitlines()
-    package, plugins = (Path(file).parent for file in shown)
-    assert package.is_relative_to(scripts.parent) and plugins == package / "plugins"
-    expected = files_of(REPOSITORY / "drgs")
-    expected |= {Path("plugins", path) for path in files_of(REPOSITORY / "plugins")}
-    assert files_of(package) == expected
 
 
 def test_the_console_script_and_the_module_are_the_same_program(scripts, tmp_path):
@@ -211,11 +201,7 @@ def test_external_package_can_use_every_extension_point(scripts, photographs):
     """A strategy, effect, loss, term, lens, falloff, file format and reader; no file of drgs."""
     folder = photographs
     source = shutil.copytree(REPOSITORY / "examples", folder / "source")
-    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input")
-    offline = ("--quiet", "--no-deps", "--no-index")
-    run(*pip, "wheel", *offline, "--no-build-isolation", "-w", folder, source, cwd=folder)
-    (wheel,) = folder.glob("drgs_examples-*.whl")
-    run(*pip, "--python", scripts / "python", "install", *offline, wheel, cwd=folder)
+    install(build_wheel(source, folder), scripts / "python")
     shutil.rmtree(source)
     (folder / "fit.yml").write_text(CONFIGURATION)
     shown = run(scripts / "drgs", "fit", "fit.yml", "--out", "out", cwd=folder)

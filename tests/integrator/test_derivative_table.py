@@ -21,7 +21,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
-from support.lit_scenes import camera, gaussians
+from support.lit_scenes import camera
+from support.reference_lenses import gaussians_at
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import UnsupportedError
@@ -227,7 +228,7 @@ def splats():
     rng = np.random.default_rng(1)
     means = rng.uniform(-1, 1, (10, 3)) * [1, 0.5, 1] + [0, 0.9, -0.5]
     colors = rng.uniform(0.2, 0.9, (10, 3))
-    found = gaussians(means, 0.3, 0.5, colors)
+    found = gaussians_at(means, 0.3, 0.5, colors)
     return {name: mi.TensorXf(v.astype(np.float32)) for name, v in vars(found).items()}
 
 

@@ -27,7 +27,7 @@ def camera_at_origin(**changes) -> Camera:
 
 
 def gaussians_at(
-    means, scales=0.1, opacity=0.5, quats=(1.0, 0.0, 0.0, 0.0), colors=0.5
+    means, scales=0.1, opacity=0.5, colors=0.5, quats=(1.0, 0.0, 0.0, 0.0)
 ) -> Gaussians:
     """Gaussians of degree 0, grey; scales and colors broadcast to (N, 3), opacity to (N,)."""
     means = np.atleast_2d(np.asarray(means, dtype=np.float64))
