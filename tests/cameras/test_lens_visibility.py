@@ -4,13 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.helpers import (
-    FLOAT32,
-    FLOAT64,
-    both_precisions,
-    rows,
-    single,
-)
+from support.helpers import FLOAT32, FLOAT64, both_precisions, rows, single
 from support.lens_scenes import (
     LENSES,
     camera_behind,

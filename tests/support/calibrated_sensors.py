@@ -9,13 +9,7 @@ import numpy as np
 
 from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.reference.effects import (
-    Equirectangular,
-    Fisheye,
-    OpenCV,
-    Pinhole,
-    ThinPrismFisheye,
-)
+from drgs.reference.effects import Equirectangular, Fisheye, OpenCV, Pinhole, ThinPrismFisheye
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES
 from support.rolling_shutter import rolling_image

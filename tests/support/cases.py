@@ -15,13 +15,7 @@ from drgs.cameras.motion import MotionBlur, RollingShutter
 from drgs.core.arrays import types_of
 from drgs.reference import effects, rays
 from drgs.reference import splatting as reference
-from drgs.testing import (
-    Case,
-    Values,
-    adjoint_is_transpose,
-    bytes_are_reproducible,
-    single,
-)
+from drgs.testing import Case, Values, adjoint_is_transpose, bytes_are_reproducible, single
 from support import helpers
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import (
