@@ -38,6 +38,14 @@ def pytest_configure(config):
         dr.set_thread_count(1)
 
 
+def run_program(*command, cwd=REPOSITORY, **options):
+    """Return the standard output of a process that succeeds; options: see subprocess.run."""
+    words = [str(word) for word in command]
+    result = subprocess.run(words, cwd=cwd, capture_output=True, text=True, **options)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
 def copy_checkout(folder):
     """Copy what a package is built from to a new folder."""
     for name in ("drgs", "plugins"):

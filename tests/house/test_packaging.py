@@ -4,12 +4,11 @@ The build backend alone makes what is installed: offline, and without pip.
 """
 
 import importlib.util
-import subprocess
 import sys
 import zipfile
 
 import pytest
-from conftest import REPOSITORY, copy_checkout
+from conftest import REPOSITORY, copy_checkout, run_program
 
 PRINT_PLUGINS_PATH = (
     "import drgs, drgs.plugins, drgs.io, drgs.datasets; print(drgs.plugins.__file__)"
@@ -21,10 +20,7 @@ def site_packages(checkout, folder, hook):
     if importlib.util.find_spec("hatchling") is None:
         pytest.skip("hatchling is not installed")
     program = f"from hatchling import build; build.{hook}({str(folder)!r})"
-    result = subprocess.run(
-        [sys.executable, "-c", program], cwd=checkout, capture_output=True, text=True
-    )
-    assert result.returncode == 0, result.stderr
+    run_program(sys.executable, "-c", program, cwd=checkout)
     (wheel,) = folder.glob("*.whl")
     with zipfile.ZipFile(wheel) as file:
         file.extractall(folder)
@@ -75,10 +71,8 @@ def test_an_editable_install_wins_over_a_clone_of_the_same_name(tmp_path):
         "import drgs.plugins; print(drgs.plugins.__file__)\n"
         "print(type(mi.load_dict({'type': 'splats'})).__name__)"
     )
-    result = subprocess.run(
-        [sys.executable, "-S", "-c", program], cwd=tmp_path, capture_output=True, text=True
-    )
-    package, plugins, integrator = result.stdout.splitlines() or [result.stderr] * 3
+    shown = run_program(sys.executable, "-S", "-c", program, cwd=tmp_path)
+    package, plugins, integrator = shown.splitlines()
     assert package == str(checkout / "drgs" / "__init__.py")
     assert plugins == str(checkout / "plugins" / "__init__.py")
     assert integrator == "SplatsIntegrator"

@@ -2,13 +2,12 @@
 
 import ast
 import re
-import subprocess
 import sys
 from contextlib import nullcontext
 
 import drjit as dr
 import numpy as np
-from conftest import REPOSITORY
+from conftest import REPOSITORY, run_program
 from drjit.llvm.ad import Float, UInt32
 from support.kernels import launched
 
@@ -103,8 +102,7 @@ print("<8 x float>" in ir, "+avx512" in ir, "+avx2" in ir)
 
 def test_avx512_can_be_disabled():
     """In a process of its own, since there is no way back."""
-    run = [sys.executable, "-c", PROGRAM]
-    result = subprocess.run(run, capture_output=True, text=True, check=True).stdout
+    result = run_program(sys.executable, "-c", PROGRAM)
     if vector_width() == 16:
         assert result.split() == ["True", "False", "True"]
     else:

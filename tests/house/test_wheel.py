@@ -6,7 +6,6 @@ Nothing is fetched: the build tools and the dependencies are those of this envir
 import json
 import os
 import shutil
-import subprocess
 import sys
 import sysconfig
 from importlib.util import find_spec
@@ -14,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY, copy_checkout
+from conftest import REPOSITORY, copy_checkout, run_program
 from PIL import Image
 from support.small_capture import blobs, make_dataset
 
@@ -44,17 +43,9 @@ SCENE = """<scene version="3.0.0">
 
 
 def run(*command, cwd):
-    """Standard output of a process that succeeds."""
-    result = subprocess.run(
-        [str(word) for word in command],
-        cwd=cwd,
-        env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
-    return result.stdout
+    """Return the standard output of a process that succeeds, far from the checkout."""
+    variables = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    return run_program(*command, cwd=cwd, env=variables, timeout=300)
 
 
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-input")

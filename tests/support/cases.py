@@ -27,6 +27,7 @@ from support.lens_scenes import (
     seen_points,
 )
 from support.rolling_shutter import rolling_image
+from support.smoothing import smoothed_reference
 
 MOTION_SAMPLES = 3
 PINHOLE = effects.Pinhole()
@@ -62,17 +63,14 @@ MODEL_FIELDS = set(rays.ImageModel.__dataclass_fields__)
 
 def by_effects(case, values, lens=PINHOLE):
     """Lenses, with an aperture and a smoothing filter."""
+    gaussians = reference.Gaussians(**values)
     if case.smoothing is not None:
-        rates = np.full(case.count, np.sqrt(effects.SMOOTHING_VARIANCE) / case.smoothing)
-        given = values["log_scales"], values["logit_opacities"], rates
-        scales, opacities = effects.smoothing_filter(*given)
-        logits = np.log(opacities / (1 - opacities))
-        values = {**values, "log_scales": np.log(scales), "logit_opacities": logits}
+        gaussians = smoothed_reference(gaussians, np.full(case.count, case.smoothing))
     defocus = case.aperture and effects.ThinLens(*case.aperture)
     antialiased = case.approximations.get("antialiased", False)
     return planes_of(
         effects.render(
-            reference.Gaussians(**values), reference_camera(case), lens, np.zeros(3), antialiased,
+            gaussians, reference_camera(case), lens, np.zeros(3), antialiased,
             defocus, case.degree, NEAR_THRESHOLD,
         )
     )  # fmt: skip

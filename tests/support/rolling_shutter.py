@@ -1,4 +1,4 @@
-"""What a rolling shutter shows, by the float64 reference."""
+"""The image of a rolling shutter, by the float64 reference."""
 
 from __future__ import annotations
 
