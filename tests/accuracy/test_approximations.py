@@ -136,7 +136,6 @@ CHOSEN_MODULES = (
     "unscented",
 )  # fmt: skip
 
-
 PROGRAM = """
 import json, sys
 sys.path.insert(0, {tests!r})

@@ -40,9 +40,7 @@ CAMERAS = {
     ),
 }
 
-
 both_emitters = pytest.mark.parametrize("emitter", EMITTERS)
-
 
 ON_BLACK = {"background": 0.0, "srgb_primitives": False}
 

@@ -14,7 +14,6 @@ import drgs  # noqa: F401  (registers the plugins)
 ROUNDING = 4e-4
 """Mitsuba moves rays that go on from a surface by 1e-4: so much is the shift of what they see."""
 
-
 PANES = {
     "null": {"type": "null"},
     "mask": {"type": "mask", "opacity": 0.0, "bsdf": {"type": "diffuse"}},

@@ -290,7 +290,6 @@ WRONG = {
     "harmonics exchanged": (COLORED, lambda g, _: replace(g, shN=in_another_order(g.shN))),
 }
 
-
 APPROXIMATIONS = {"low-pass": {"low_pass": 0.3}, "projected at the mean": {"projection": "ewa"}}
 
 

@@ -47,7 +47,6 @@ MOVED = 45 * 56 + 3 * 64
 # The principal point, the sum with it, and a pixel's distance from it, twice.
 CROPPED = 6 * 64
 
-
 ROUNDOFF = {FLOAT64: 2.0**-53, FLOAT32: 2.0**-24}
 """The largest relative error of one operation."""
 

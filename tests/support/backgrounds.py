@@ -33,7 +33,6 @@ EMITTERS = {
     },
 }  # fmt: skip
 
-
 CLOSE = np.array(pose([0.2, -1.0, 0.4], 46, (0.5, -0.65, 1.0)))
 INTRINSICS = {"fx": 30.0, "fy": 27.0, "cx": 17.0, "cy": 12.5}
 

@@ -394,7 +394,6 @@ CASES = [
     ),
 ]
 
-
 SPECIAL_CASES = {thresholds: (adjoint_is_transpose, bytes_are_reproducible)}
 """Functions that make cases to which few laws apply, and these laws: where decisions are taken at
 equality, no step is small enough for differences."""

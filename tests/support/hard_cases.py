@@ -20,13 +20,10 @@ from support.helpers import (
 
 ROUNDINGS = 25
 
-
 BOUND = 6 * np.sqrt(ROUNDINGS)
-
 
 UNDERFLOW = 1e-15
 """Fraction of an array's largest value below which values may be lost to underflow (1e-38)."""
-
 
 PLANES = ("image", "alpha", "depth", "transmittance")
 
@@ -404,7 +401,6 @@ def errors_over_bounds(actual, wanted, bounds, precision, left_out=None) -> dict
 
 SCALES = {FLOAT32: 1.0, FLOAT64: 2 * 2.0**-29}
 """float64 has 2^-29 times the noise; the reference, which is as inexact, doubles it."""
-
 
 EXACT = 1e-11
 """Error of the reference itself, relative to an array's largest value. It evaluates the textbook's

@@ -278,6 +278,11 @@ def device_gaussians(gaussians: reference.Gaussians, precision: Precision) -> Ga
     return replace(device, logit_opacities=precision.array(gaussians.logit_opacities))
 
 
+def host_gaussians(gaussians: reference.Gaussians) -> Gaussians:
+    """In single precision, as files hold them."""
+    return Gaussians(**{n: getattr(gaussians, n).astype(np.float32) for n in PARAMETER_NAMES})
+
+
 def reference_gaussians(gaussians: Gaussians) -> reference.Gaussians:
     """The other way round."""
     return reference.Gaussians(**{n: np.array(getattr(gaussians, n)) for n in PARAMETER_NAMES})

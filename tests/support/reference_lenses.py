@@ -11,7 +11,6 @@ from drgs.reference.splatting import Camera, Gaussians
 
 FISHEYE = Fisheye(-0.03125, 0.015625, -0.0078125, 0.001953125)
 
-
 THIN_PRISM = ThinPrismFisheye(
     -0.03125, 0.015625, -0.0078125, 0.001953125, 0.0078125, -0.00390625, -0.015625, 0.01171875
 )

@@ -13,7 +13,7 @@ from drgs.cameras.viewpoints import Viewpoint
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
-from support.helpers import NEAR_THRESHOLD
+from support.helpers import NEAR_THRESHOLD, host_gaussians
 
 WIDTH, HEIGHT = 32, 24
 FIELD_OF_VIEW = 0.7  # radians, horizontal
@@ -25,7 +25,7 @@ WHITE = (1.0, 1.0, 1.0)
 def blobs(count=30, seed=0) -> Gaussians:
     """Opaque and coloured, within a unit of the focus, numpy float32."""
     rng = np.random.default_rng(seed)
-    g = reference.Gaussians(
+    found = reference.Gaussians(
         means=FOCUS + rng.uniform(-0.6, 0.6, (count, 3)),
         quats=rng.normal(size=(count, 4)),
         log_scales=np.log(rng.uniform(0.08, 0.3, (count, 3))),
@@ -33,7 +33,7 @@ def blobs(count=30, seed=0) -> Gaussians:
         sh0=rng.uniform(-1.5, 1.5, (count, 1, 3)),
         shN=rng.normal(0, 0.2, (count, 3, 3)),
     )
-    return Gaussians(**{name: getattr(g, name).astype(np.float32) for name in PARAMETER_NAMES})
+    return host_gaussians(found)
 
 
 def pose_around(azimuth: float, elevation: float, radius=RADIUS) -> np.ndarray:
