@@ -103,6 +103,7 @@ def test_every_study_has_help(load_script, name, capsys):
     ("name", "arguments", "printed"),
     [
         ("hybrid", "--gaussians 100 --size 16 --rounds 1", "| 100 |"),
+        ("effects", "--quick", "| camera refinement | pose and focal lengths |"),
         ("kernels", "--gaussians 200 --size 32 --rounds 1", "| a training iteration |"),
         ("prediction", "--quick", "| 64 | 25 Gbit/s |"),
     ],
