@@ -25,11 +25,11 @@ from drgs.bench.scenes import (
     bench_gaussians,
     mitsuba_pose,
     mitsuba_sensor,
-    trainer_of,
 )
 from drgs.bench.timing import count_operations, seconds
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
+from stages import trainer_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,11 +14,10 @@ import pytest
 from PIL import Image
 from support import small_capture
 from support.commands import assert_refused
-from support.helpers import FLOAT32 as SINGLE
-from support.helpers import Case, clear, device_camera, device_gaussians, reference_gaussians
+from support.helpers import reference_gaussians
 
 from drgs.bench import __main__ as bench
-from drgs.bench import accuracy, scenes, speed, stability, timing
+from drgs.bench import accuracy, speed, stability
 from drgs.bench.__main__ import COMMANDS
 from drgs.bench.output import add_out
 from drgs.bench.scenes import bench_camera, bench_gaussians
@@ -26,9 +25,7 @@ from drgs.cli.commands import CommandParser
 from drgs.core.errors import UserError
 from drgs.datasets.types import View
 from drgs.reference import rays as reference_rays
-from drgs.reference import splatting as reference
 from drgs.results import metrics
-from drgs.splatting import rendering
 
 
 @pytest.mark.slow
@@ -48,47 +45,9 @@ def test_stability_finds_no_error_beyond_the_conditioning(tmp_path):
         assert float(row["left_out"]) < 0.1
 
 
-def test_useful_pairs_match_the_reference():
-    case = clear(Case("pairs", 40, 35, 0, count=80))
-    inputs = device_gaussians(case.gaussians, SINGLE), device_camera(case.camera, SINGLE)
-    work = timing.count_work(rendering.render(*inputs, rendering.Pipeline(0)))
-    splats = reference.project(case.gaussians, case.camera)
-    order = reference.depth_order(splats.depths, splats.visible)
-    y, x = np.mgrid[: case.height, : case.width] + 0.5
-    transmittance, finished, useful = np.ones(x.shape), np.zeros(x.shape, bool), 0
-    for i in order:
-        d = np.stack([x - splats.means2d[i, 0], y - splats.means2d[i, 1]], axis=-1)
-        exponent = -0.5 * np.einsum("hwi,ij,hwj->hw", d, splats.conics[i], d)
-        alpha = np.minimum(splats.opacities[i] * np.exp(exponent), reference.ALPHA_MAX)
-        seen = (alpha >= reference.ALPHA_CUT) & ~finished
-        finished |= seen & (transmittance * (1 - alpha) < reference.TRANSMITTANCE_STOP)
-        seen &= ~finished
-        transmittance = np.where(seen, transmittance * (1 - alpha), transmittance)
-        useful += int(seen.sum())
-    assert work.useful == useful > 1000
-    assert work.useful <= work.evaluated <= 16 * work.micro_entries
-    assert work.entries <= work.micro_entries <= 16 * work.entries
-
-
-@pytest.fixture
-def small_scene():
+def test_renderers_do_not_reuse_a_frame():
     mi.set_variant("llvm_ad_rgb")
-    return scenes.Scene("small", bench_gaussians(500), bench_camera(48))
-
-
-def test_an_iteration_is_profiled(small_scene):
-    """Every kernel of it belongs to a stage."""
-    before = rendering.bin_footprints
-    report = speed.profile_training(small_scene, rounds=2)
-    assert rendering.bin_footprints is before
-    assert report.wall_ms > 0 and report.kernel_ms > 0
-    assert set(report.num_kernels) == set(timing.STAGES)
-    assert all(count > 0 for count in report.num_kernels.values())
-    assert report.work.useful > 0
-
-
-def test_renderers_do_not_reuse_a_frame(small_scene):
-    problem = speed.Problem(small_scene.gaussians, small_scene.camera, np.ones((48, 48, 3)))
+    problem = speed.Problem(bench_gaussians(500), bench_camera(48), np.ones((48, 48, 3)))
     renderer = speed.drgs_renderer(problem)
     renderer.forward()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
