@@ -45,33 +45,20 @@ MIN_SCALE = 1e-18  # world units: its square is not 0 in float32
 MAX_SKEW = 1e-6  # relative to the largest number in K: rounding
 OPAQUE_LOGIT = 100.0  # its sigmoid is 1 in float64
 
-MITSUBA_CAMERAS = (
-    "leave it out for pinholes at rest; other cameras are Mitsuba's sensors, which mi.render takes "
-    "with the integrator splats"
-)
-
-UNSUPPORTED_GSPLAT_ARGUMENTS = {
+GSPLAT_REMEDIES = {
     "far_plane": "leave out the Gaussians beyond it",
     "radius_clip": "leave it out: small splats cost little",
-    "packed": "leave it out: results have a row for each Gaussian",
-    "sparse_grad": "leave it out: gradients have a row for each Gaussian",
+    "packed sparse_grad": "leave it out: results and gradients have a row for each Gaussian",
     "absgrad": "leave it out: gradients are summed with their signs",
     "covars": "give quats and scales",
     "with_ut": 'give projection="unscented"',
     "with_eval3d": 'give projection="exact"',
-    "tile_size": "leave it out",
-    "channel_chunk": "leave it out",
-    "distributed": "leave it out",
-    "segmented": "leave it out",
-    "camera_model": MITSUBA_CAMERAS,
-    "radial_coeffs": MITSUBA_CAMERAS,
-    "tangential_coeffs": MITSUBA_CAMERAS,
-    "thin_prism_coeffs": MITSUBA_CAMERAS,
-    "ftheta_coeffs": MITSUBA_CAMERAS,
-    "rolling_shutter": MITSUBA_CAMERAS,
-    "viewmats_rs": MITSUBA_CAMERAS,
+    "tile_size channel_chunk distributed segmented": "leave it out",
+    "camera_model radial_coeffs tangential_coeffs thin_prism_coeffs ftheta_coeffs rolling_shutter "
+    "viewmats_rs": "leave it out for pinholes at rest; other cameras are Mitsuba's sensors, which "
+    "mi.render takes with the integrator splats",
 }
-"""Parameters of gsplat that drgs does not have, and remedies."""
+"""Remedies by the parameters of gsplat, separated by spaces, that drgs does not have."""
 
 SHAPES: dict[str, list[tuple[str | int, ...]]] = {
     "means": [("N", 3)],
@@ -197,9 +184,9 @@ def _approximations(
     known = {f.name for f in fields(Approximations)} - {"low_pass", "antialiased"}
     for name in others.keys() - known:
         reason = f"there is no parameter {name}{did_you_mean(name, known)}"
-        if name in UNSUPPORTED_GSPLAT_ARGUMENTS:
-            remedy = UNSUPPORTED_GSPLAT_ARGUMENTS[name]
-            reason = f"{name} is a parameter of gsplat's that drgs does not have; {remedy}"
+        for theirs, remedy in GSPLAT_REMEDIES.items():
+            if name in theirs.split():
+                reason = f"{name} is a parameter of gsplat's that drgs does not have; {remedy}"
         raise TypeError(f"rasterization(): {reason}")
     if others.get("sh_direction", "mean") != "mean" and sh_degree is None:
         raise ValueError(

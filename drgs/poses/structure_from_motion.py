@@ -35,7 +35,7 @@ from drgs.datasets.files import is_image, masks_of, without_masks
 from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
 from drgs.io.images import check_readable, image_size, write_png
-from drgs.poses.child_process import ChildEndedError, DeferredInterrupts, run_in_child
+from drgs.poses.child_process import ChildEndedError, run_in_child
 
 if TYPE_CHECKING:
     import pycolmap
@@ -173,7 +173,7 @@ def reconstruct(folder: Path, settings: SfmSettings, replace: bool, watch: Progr
     """
     photographs, names = photographs_in(folder)
     model = folder / "sparse" / "0"
-    with DeferredInterrupts() as interrupts, sole_writer(folder) as keep:
+    with sole_writer(folder) as keep:
         _check_free(folder, model, replace)
         try:
             if keep():  # remove files of runs that were killed
@@ -185,7 +185,7 @@ def reconstruct(folder: Path, settings: SfmSettings, replace: bool, watch: Progr
             with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=parent) as temporary:
                 found = run_in_child(
                     _reconstruct_in_child, settings, photographs, folder, names, Path(temporary),
-                    watch=watch, interrupts=interrupts,
+                    watch=watch,
                 )  # fmt: skip
                 _install_model(Path(temporary, "model"), model)
         except BrokenPipeError:  # of the output, whose reader has gone

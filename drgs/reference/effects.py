@@ -131,14 +131,13 @@ class Pinhole(Lens):
 
     @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        return _focal(camera) * points[:, :2] / points[:, 2:] + _principal(camera)
+        return camera.film_points(points)
 
     @override
     def slope_bounds(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Return the slopes (2,), (2,) of the film's corners (0, 0) and (W, H)."""
-        corners = np.array([[0.0, 0.0], [camera.width, camera.height]])
-        lower, upper = (corners - _principal(camera)) / _focal(camera)
-        return lower, upper
+        lower, upper = (0 - camera.principal), (camera.size - camera.principal)
+        return lower / camera.focal, upper / camera.focal
 
 
 @dataclass(frozen=True)
@@ -167,7 +166,7 @@ class OpenCV(Lens):
     @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         slopes = points[:, :2] / points[:, 2:]
-        return _focal(camera) * self.distort(slopes) + _principal(camera)
+        return camera.focal * self.distort(slopes) + camera.principal
 
     @override
     def is_seen(self, camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -187,7 +186,7 @@ class OpenCV(Lens):
         None if one of the border's points is the image of no slope within ``valid_radius``: the
         slopes of the others need not hold all that the film shows.
         """
-        border = (_film_border(camera) - _principal(camera)) / _focal(camera)
+        border = (_film_border(camera) - camera.principal) / camera.focal
         slopes = self.undistort(border)
         return (slopes.min(axis=0), slopes.max(axis=0)) if np.isfinite(slopes).all() else None
 
@@ -267,7 +266,7 @@ class Fisheye(Lens):
             k * theta ** (2 * i) for i, k in enumerate([1.0, self.k1, self.k2, self.k3, self.k4])
         )
         spread = (polynomial * theta_by_rho)[:, None]
-        return _focal(camera) * spread * points[:, :2] + _principal(camera)
+        return camera.focal * spread * points[:, :2] + camera.principal
 
     @override
     def depths(self, camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -312,7 +311,7 @@ class ThinPrismFisheye(Fisheye):
         rho = np.linalg.norm(points[:, :2], axis=1)
         theta_by_rho = np.arctan2(rho, points[:, 2]) / np.where(rho == 0, 1.0, rho)
         distorted = self.distort(theta_by_rho[:, None] * points[:, :2])
-        return _focal(camera) * distorted + _principal(camera)
+        return camera.focal * distorted + camera.principal
 
     def distort(self, places: np.ndarray) -> np.ndarray:
         """Return (..., 2) places (u', v') of places (u, v) (..., 2), which may be complex."""
@@ -368,7 +367,7 @@ class Orthographic(Lens):
 
     @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        return _focal(camera) * points[:, :2] + _principal(camera)
+        return camera.focal * points[:, :2] + camera.principal
 
     @override
     def view_directions(self, camera: Camera, means: np.ndarray) -> np.ndarray:
@@ -390,7 +389,7 @@ class Equirectangular(Lens):
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         x, y, z = points.T
         angles = np.column_stack([np.arctan2(x, z) / 2, np.arctan2(y, np.hypot(x, z))])
-        return np.array([camera.width, camera.height]) * (angles / np.pi + 0.5)
+        return camera.size * (angles / np.pi + 0.5)
 
     @override
     def depths(self, camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -467,14 +466,6 @@ def _first_fold(lens: OpenCV | ThinPrismFisheye, radius: float) -> float:
     return float(low)
 
 
-def _focal(camera: Camera) -> np.ndarray:
-    return np.array([camera.fx, camera.fy])
-
-
-def _principal(camera: Camera) -> np.ndarray:
-    return np.array([camera.cx, camera.cy])
-
-
 def _film_border(camera: Camera) -> np.ndarray:
     """Return (4 BORDER_SAMPLES, 2), px: evenly spaced points of the film's edges."""
     x = np.linspace(0, camera.width, BORDER_SAMPLES)
@@ -521,7 +512,7 @@ class ThinLens:
         f a (1 / focus_distance - 1 / z).
         """
         spread = self.aperture_radius * np.abs(1 / self.focus_distance - 1 / depths)
-        return _focal(camera) * spread[:, None]
+        return camera.focal * spread[:, None]
 
 
 def project(
@@ -559,7 +550,7 @@ def project(
     axes = camera.rotation @ reference.quat_to_rotation(gaussians.quats) * scales[:, None, :]
     axes2d = jacobians(lens, camera, _points_of_jacobian(lens, camera, points)) @ axes
     widening = np.full((len(points), 2), low_pass)
-    cov2d, dets, areas = _widen(axes2d, widening)
+    cov2d, dets, areas = reference.widened_covariances(axes2d, widening)
     singular = dets == 0
     opacities = reference.sigmoid(gaussians.logit_opacities)
     if antialiased:
@@ -573,7 +564,7 @@ def project(
             )
         radii = defocus.blur_radii(camera, np.where(seen, depths, 1.0))
         dets_in_focus = dets
-        cov2d, dets, _ = _widen(axes2d, widening + radii**2 / 4)
+        cov2d, dets, _ = reference.widened_covariances(axes2d, widening + radii**2 / 4)
         singular = dets == 0
         dimming = np.sqrt(dets_in_focus / np.where(singular, 1.0, dets))
         opacities, cuts = opacities * dimming, np.maximum(cuts * dimming, MIN_CUT)
@@ -624,18 +615,6 @@ def _points_of_jacobian(lens: Lens, camera: Camera, points: np.ndarray) -> np.nd
     margin = reference.FRUSTUM_MARGIN * (upper - lower) / 2
     z = points[:, 2:]
     return np.hstack([np.clip(points[:, :2] / z, lower - margin, upper + margin) * z, z])
-
-
-def _widen(axes2d: np.ndarray, widening: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return cov2d = M M^T + diag(t) (N, 2, 2), det(cov2d) (N,) and sqrt(det(M M^T)) (N,).
-
-    M (N, 2, 3) px; t (N, 2) px^2. det(A + diag(t)) = det(A) + t0 A11 + t1 A00 + t0 t1: sums of
-    squares, like ``reference._low_passed_covariances``, which is the case t0 = t1.
-    """
-    areas = np.linalg.norm(np.cross(axes2d[:, 0], axes2d[:, 1]), axis=-1)
-    (a, b), (t0, t1) = np.sum(axes2d**2, axis=2).T, widening.T
-    cov2d = axes2d @ np.swapaxes(axes2d, 1, 2) + widening[:, :, None] * np.eye(2)
-    return cov2d, areas**2 + t0 * b + t1 * a + t0 * t1, areas
 
 
 # ----------------------------------------------------------------------------------------------
@@ -855,8 +834,7 @@ def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
         points = (means - camera.center) @ camera.rotation.T
         in_front = points[:, 2] >= camera.near
         points = np.where(in_front[:, None], points, (0.0, 0.0, 1.0))
-        size = np.array([camera.width, camera.height])
-        film = Pinhole().film_points(camera, points)
+        film, size = camera.film_points(points), camera.size
         on_film = (film >= -VIEW_MARGIN * size) & (film <= (1 + VIEW_MARGIN) * size)
         rate = max(camera.fx, camera.fy) / points[:, 2]
         rates = np.where(in_front & on_film.all(axis=1), np.maximum(rates, rate), rates)
@@ -895,8 +873,7 @@ def render_with_surfaces(
     """
     splats = reference.project(gaussians, camera)
     colors = reference.sh_colors(gaussians, camera, gaussians.sh_degree)
-    order = np.flatnonzero(splats.visible)
-    order = order[np.argsort(splats.depths[order], kind="stable")]
+    order = reference.depth_order(splats.depths, splats.visible)
     shape = camera.height, camera.width
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     color, depth, coverage = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)

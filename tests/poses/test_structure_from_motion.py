@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import signal
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -426,24 +425,6 @@ def test_temporary_files_of_a_killed_run_are_removed(write_model, tmp_path):
     write_model("new")
     assert not list(tmp_path.rglob(".drgs-poses-*/"))
     assert {path.name for path in tmp_path.iterdir() if path.is_dir()} == {"sparse", ".poses-notes"}
-
-
-def test_interrupt_while_moving_files_leaves_a_complete_model(write_model, tmp_path, monkeypatch):
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    replace = Path.replace
-
-    def interrupted(self, target):
-        signal.raise_signal(signal.SIGINT)
-        return replace(self, target)
-
-    monkeypatch.setattr(Path, "replace", interrupted)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            write_model("new")
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert model_in(tmp_path) == model("new")
-    assert not list(tmp_path.glob(".drgs-*"))
 
 
 def test_run_killed_while_moving_files_leaves_no_mixed_model(write_model, tmp_path, monkeypatch):
