@@ -41,6 +41,7 @@ from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.results import metrics
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS
+from drgs.results.folder import require_results
 from drgs.results.model_arguments import error_budget
 from drgs.splatting import rendering
 from drgs.splatting.footprint import PixelCenters, SamplePositions
@@ -218,9 +219,7 @@ def load_subject(path: Path, num_views: int) -> Subject:
         )
     ply, config_file = path / GAUSSIANS_FOR_VIEWERS, path / CONFIG
     ply = ply if ply.exists() else path / GAUSSIANS
-    for file in (ply, config_file):
-        if not file.exists():
-            raise UserError(f"{file}: not there; {path} must be the folder of a finished fit")
+    require_results(path, ply.name)
     config = load_config(str(config_file), [])
     gaussians = bake_smoothing(Gaussians.load(ply))
     dataset = load_dataset(config.data).relative_to(gaussians.origin)

@@ -6,13 +6,12 @@ neighbours. The cost is in closed form here instead of by sampling.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from drgs.export.selection import take
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
 NUM_NEIGHBOURS = 12
@@ -66,6 +65,14 @@ def merge_down(gaussians: Gaussians[np.ndarray], count: int) -> Gaussians[np.nda
         for name in PARAMETER_NAMES
     }
     return replace(kept, **joined)
+
+
+def take(gaussians: Gaussians[np.ndarray], rows: np.ndarray) -> Gaussians[np.ndarray]:
+    """Return some of the Gaussians; rows: indices, or a mask (N,)."""
+    values = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
+    arrays = {name: v[rows] for name, v in values.items() if isinstance(v, np.ndarray)}
+    features = gaussians.features and {k: v[rows] for k, v in gaussians.features.items()}
+    return replace(gaussians, **arrays, features=features)
 
 
 def shapes_of(gaussians: Gaussians[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -224,5 +224,5 @@ def test_views_other_than_static_pinholes_are_refused(tmp_path, has):
     message = f"has {has}, expected pinhole cameras at rest"
     line = assert_refused(bench.main, "accuracy", fit, folder=tmp_path, message=message)
     assert f"give {fit / 'point_cloud.ply'} instead" in line
-    message = "must be the folder of a finished fit"
+    message = "must be the output folder of a fit that has ended"
     assert_refused(bench.main, "accuracy", tmp_path, folder=tmp_path, message=message)
