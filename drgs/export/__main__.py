@@ -1,6 +1,6 @@
 """``python -m drgs.export RUN_OR_FILE --format NAME``: Gaussians for other programs.
 
-Exports a file, or a fit's file for other programs (``drgs.fit.for_viewers``), in the formats of
+Exports a file, or a fit's file for other programs (``drgs.fit.viewers_fit``), in the formats of
 ``drgs.io.formats``; crops, filters, decimates and turns it upright.
 """
 
@@ -35,7 +35,7 @@ from drgs.export.source import ExportSource, Honoured, load_source
 from drgs.io import sog
 from drgs.io.formats import format_for, writable_formats
 from drgs.results.files import VIEWS
-from drgs.results.viewer_page import HONOURED, DisplaySettings, InitialView, viewer_page
+from drgs.results.html_viewer import HONOURED, DisplaySettings, InitialView, viewer_page
 
 COMMAND = "export"
 
