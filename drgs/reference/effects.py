@@ -493,16 +493,8 @@ def _first_positive_root(coefficients: ArrayLike) -> float:
 class ThinLens:
     """An aperture, a disc about the camera's centre, and the plane that is in focus."""
 
-    aperture_radius: float  # world units
-    focus_distance: float  # world units: camera z of what is in focus
-
-    def __post_init__(self) -> None:
-        """Refuse numbers out of range."""
-        if not (0 <= self.aperture_radius < inf and 0 < self.focus_distance < inf):
-            raise ValueError(
-                "reference_effects.ThinLens: aperture_radius must be >= 0, focus_distance > 0 and "
-                f"both finite, got {self.aperture_radius} and {self.focus_distance}"
-            )
+    aperture_radius: float  # world units, >= 0
+    focus_distance: float  # world units, > 0: camera z of what is in focus
 
     def blur_radii(self, camera: Camera, depths: np.ndarray) -> np.ndarray:
         """Return (N, 2), px: half axes of the ellipse over which a point at depth (N,) is spread.
@@ -539,7 +531,7 @@ def project(
 
     Splats with a singular cov2d, which low_pass = 0 permits, are not visible.
 
-    Raises ValueError for defocus behind an orthographic lens, whose rays meet in no aperture.
+    Defocus is not defined behind an orthographic lens, whose rays meet in no aperture.
     """
     points = (gaussians.means - camera.center) @ camera.rotation.T
     depths = lens.depths(camera, points)
@@ -557,11 +549,6 @@ def project(
         opacities = opacities * areas / np.sqrt(np.where(singular, 1.0, dets))
     above_cut, cuts = opacities > reference.ALPHA_CUT, reference.ALPHA_CUT
     if defocus is not None:
-        if isinstance(lens, Orthographic):
-            raise ValueError(
-                "reference_effects.project: defocus needs a lens whose rays meet in its centre, "
-                "got Orthographic"
-            )
         radii = defocus.blur_radii(camera, np.where(seen, depths, 1.0))
         dets_in_focus = dets
         cov2d, dets, _ = reference.widened_covariances(axes2d, widening + radii**2 / 4)
@@ -739,15 +726,8 @@ def _quat_of_rotation(rotation: np.ndarray) -> np.ndarray:
 def camera_at(camera_open: Camera, camera_close: Camera, t: float) -> Camera:
     """Return the camera at time t, 0 to 1, of the exposure; see ``interpolate_pose``.
 
-    Raises ValueError if the two differ in anything but their pose.
+    The two differ in nothing but their pose.
     """
-    for field in fields(Camera):
-        values = getattr(camera_open, field.name), getattr(camera_close, field.name)
-        if field.name not in ("rotation", "center") and values[0] != values[1]:
-            raise ValueError(
-                f"reference_effects.camera_at: {field.name} must be the same when the shutter "
-                f"opens and when it closes, got {values[0]} and {values[1]}"
-            )
     rotation, center = interpolate_pose(
         (camera_open.rotation, camera_open.center), (camera_close.rotation, camera_close.center), t
     )
@@ -826,8 +806,6 @@ def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     z >= near and the mean lies on its film, widened by 15 percent of its width and height on each
     side. A mean that no camera samples gets the smallest rate of all that are sampled, and so is
     smoothed most, as in Mip-Splatting's code, which gives it the largest distance.
-
-    Raises ValueError if there are means and no camera samples any of them.
     """
     rates = np.zeros(len(means))
     for camera in cameras:
@@ -838,11 +816,6 @@ def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
         on_film = (film >= -VIEW_MARGIN * size) & (film <= (1 + VIEW_MARGIN) * size)
         rate = max(camera.fx, camera.fy) / points[:, 2]
         rates = np.where(in_front & on_film.all(axis=1), np.maximum(rates, rate), rates)
-    if len(rates) and not rates.any():
-        raise ValueError(
-            f"reference_effects.sampling_rates: none of {len(cameras)} cameras sees any of the "
-            f"{len(rates)} means"
-        )
     return np.where(rates > 0, rates, rates[rates > 0].min(initial=inf))
 
 

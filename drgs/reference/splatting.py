@@ -73,22 +73,12 @@ class Camera:
     cy: float  # px, film
     width: int  # px
     height: int  # px
-    near: float = 0.01  # world units: means with a smaller camera z are culled
+    near: float = 0.01  # world units, > 0: means with a smaller camera z are culled
 
     def __post_init__(self) -> None:
-        """Convert to float64 and check shapes."""
-        for name, shape in {"rotation": (3, 3), "center": (3,)}.items():
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            if value.shape != shape:
-                raise ValueError(
-                    f"reference.Camera: {name} must have shape {shape}, got {value.shape}"
-                )
-            object.__setattr__(self, name, value)
-        if not self.near > 0:
-            raise ValueError(
-                f"reference.Camera: near must be > 0, since projection divides by z, "
-                f"got {self.near}"
-            )
+        """Convert to float64."""
+        for name in ("rotation", "center"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
 
     @property
     def focal(self) -> np.ndarray:
@@ -119,31 +109,12 @@ class Gaussians:
     log_scales: np.ndarray  # (N, 3) natural logarithm of standard deviations in world units
     logit_opacities: np.ndarray  # (N,)
     sh0: np.ndarray  # (N, 1, 3) coefficient of degree 0, RGB, display space
-    shN: np.ndarray  # (N, K - 1, 3) the others, K = (degree + 1)^2  # noqa: N815
+    shN: np.ndarray  # (N, K - 1, 3) the others, K = (degree + 1)^2, degree 0 to 3  # noqa: N815
 
     def __post_init__(self) -> None:
-        """Convert to float64 and check shapes."""
-        for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN"):
+        """Convert to float64."""
+        for name in vars(self):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
-        n = len(self.means)
-        shapes = {
-            "means": (n, 3),
-            "quats": (n, 4),
-            "log_scales": (n, 3),
-            "logit_opacities": (n,),
-            "sh0": (n, 1, 3),
-        }
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(
-                    f"reference.Gaussians: {name} must have shape {shape} like the {n} means, "
-                    f"got {getattr(self, name).shape}"
-                )
-        if self.shN.shape not in [(n, (degree + 1) ** 2 - 1, 3) for degree in range(4)]:
-            raise ValueError(
-                f"reference.Gaussians: shN must have shape ({n}, 0, 3), ({n}, 3, 3), "
-                f"({n}, 8, 3) or ({n}, 15, 3) for degree 0, 1, 2 or 3, got {self.shN.shape}"
-            )
 
     @property
     def sh_degree(self) -> int:
@@ -235,7 +206,6 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     Column l^2 + l + m holds degree l, order m, with the signs of 3DGS. They are orthonormal on
     the sphere.
     """
-    _check_degree("sh_basis", degree, 3)
     x, y, z = directions.T
     basis = [
         C_00 * np.ones_like(x),
@@ -263,7 +233,6 @@ def sh_basis_gradient(directions: np.ndarray, degree: int) -> np.ndarray:
 
     x, y, z vary independently here; the unit length of a direction is the caller's business.
     """
-    _check_degree("sh_basis_gradient", degree, 3)
     x, y, z = directions.T
     zero, one = np.zeros_like(x), np.ones_like(x)
     gradient = [
@@ -313,7 +282,6 @@ def unclamped_colors(gaussians: Gaussians, directions: np.ndarray, degree: int) 
 
 def _sh_coefficients(gaussians: Gaussians, degree: int) -> np.ndarray:
     """Return (N, K, 3): the coefficients up to ``degree``."""
-    _check_degree("sh_colors", degree, gaussians.sh_degree)
     coefficients = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
     return coefficients[:, : (degree + 1) ** 2]
 
@@ -925,8 +893,3 @@ def _rows_where(condition: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def _transpose(matrices: np.ndarray) -> np.ndarray:
     return np.swapaxes(matrices, -1, -2)
-
-
-def _check_degree(where: str, degree: int, highest: int) -> None:
-    if degree not in range(highest + 1):
-        raise ValueError(f"reference.{where}: degree must be 0 to {highest}, got {degree}")
