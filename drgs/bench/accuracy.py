@@ -3,8 +3,7 @@
 Compares renderings of a trained and a stress scene (wide lens, large splats near the camera,
 interpenetrating layers) with the most accurate form: the float64 numpy reference that evaluates
 splats and harmonics along each pixel's ray, sorts all splats at each pixel, and cuts only alphas
-below a millionth. What error budgets choose is measured like the other choices. A fit's images are
-also compared with the photographs.
+below a millionth. What error budgets choose is measured like the other choices.
 """
 
 from __future__ import annotations
@@ -98,7 +97,6 @@ class Subject:
     name: str
     gaussians: Gaussians  # numpy
     cameras: list[reference.Camera]
-    photographs: list[View]  # may be empty
     background: tuple[float, float, float]
 
 
@@ -114,7 +112,6 @@ class AccuracyMeasurement:
     psnr: float  # dB, against the most accurate form
     ssim: float
     largest_error: float
-    photo_psnr: float | None  # dB, against the photographs
 
     @property
     def root_mean_square(self) -> float:
@@ -153,7 +150,7 @@ def run(args: argparse.Namespace) -> None:
     """Measure both scenes; write table, CSV and plots."""
     subjects = [
         load_subject(Path(args.scene), 1 if args.quick else args.views),
-        Subject("stress", *stress_scene(FILM_SIZE_PX), [], (0.0, 0.0, 0.0)),
+        Subject("stress", *stress_scene(FILM_SIZE_PX), (0.0, 0.0, 0.0)),
     ]
     print(f"{machine()}")
     results = []
@@ -200,9 +197,7 @@ def load_subject(path: Path, num_views: int) -> Subject:
     """
     if not path.is_dir():
         camera = bench_camera(FILM_SIZE_PX)
-        return Subject(
-            path.stem, bake_smoothing(Gaussians.load(path)), [camera], [], (1.0, 1.0, 1.0)
-        )
+        return Subject(path.stem, bake_smoothing(Gaussians.load(path)), [camera], (1.0, 1.0, 1.0))
     ply, config_file = path / GAUSSIANS_FOR_VIEWERS, path / CONFIG
     ply = ply if ply.exists() else path / GAUSSIANS
     require_results(path, ply.name)
@@ -212,7 +207,7 @@ def load_subject(path: Path, num_views: int) -> Subject:
     views = dataset.test[:: max(1, len(dataset.test) // num_views)][:num_views]
     _check_pinholes(views, config_file, ply)
     cameras = [camera_of(view, config.model.near_plane) for view in views]
-    return Subject(path.name, gaussians, cameras, list(views), dataset.background)
+    return Subject(path.name, gaussians, cameras, dataset.background)
 
 
 def _check_pinholes(views: Sequence[View], config_file: Path, ply: Path) -> None:
@@ -330,10 +325,7 @@ def measure(
             RungRenderer.from_rung(rung, subject, camera).image() for camera in subject.cameras
         ]
         pairs = list(zip(images, accurate, strict=True))
-        quality, views = metrics.mean_quality(pairs), subject.photographs
-        photos = [
-            (image, view.image, view.mask) for image, view in zip(images, views, strict=bool(views))
-        ]
+        quality = metrics.mean_quality(pairs)
         results.append(
             AccuracyMeasurement(
                 subject.name,
@@ -343,7 +335,6 @@ def measure(
                 psnr=quality.psnr,
                 ssim=quality.ssim,
                 largest_error=max(np.abs(image - exact).max() for image, exact in pairs),
-                photo_psnr=metrics.mean_quality(photos).psnr if photos else None,
             )
         )
     return results
@@ -371,11 +362,10 @@ def table(results: Sequence[AccuracyMeasurement]) -> str:
             f"{m.psnr:.1f} dB",
             f"{m.ssim:.5f}",
             f"{m.largest_error:.2g}",
-            "" if m.photo_psnr is None else f"{m.photo_psnr:.2f} dB",
         ]
         for m in results
     ]
-    table = markdown_table([*header, "largest error", "PSNR, photographs"], rows)
+    table = markdown_table([*header, "largest error"], rows)
     return f"{table}\n\n* on the Pareto front"
 
 
