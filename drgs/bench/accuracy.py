@@ -9,7 +9,6 @@ below a millionth. What error budgets choose is measured like the other choices.
 from __future__ import annotations
 
 import argparse
-import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ import numpy as np
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.bench.output import add_out, machine, markdown_table, write_rows
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
-from drgs.bench.timing import count_operations, seconds
+from drgs.bench.timing import count_operations, time_in_turns
 from drgs.cameras.camera import Camera
 from drgs.cli.commands import CommandParser
 from drgs.config.approximations import Approximations
@@ -48,7 +47,6 @@ if TYPE_CHECKING:
 PLOTS = ("accuracy.png", "accuracy_stress.png")  # of the given scene, and of the stress scene
 ROUNDS, QUICK_ROUNDS = 9, 3
 MARKER_PX = 15  # of the plot's marker of the default
-SLOW_S, SLOW_ROUNDS = 1.0, 2  # slower rungs are timed in SLOW_ROUNDS
 FILM_SIZE_PX = 400  # film of scenes without cameras
 CROP_SIZE_PX = 8  # side of the crops on which every pixel evaluates every splat
 MIN_ALPHA = 1e-6  # alpha cut of the most accurate form
@@ -308,17 +306,7 @@ def measure(
     """Measure errors of all rungs, and their times on the first view, in turns."""
     renderers = [RungRenderer.from_rung(rung, subject, subject.cameras[0]) for rung in rungs]
     operations = [renderer.operations() for renderer in renderers]  # compiles the kernels
-    for renderer in renderers:
-        renderer.forward_backward()
-    slow = [seconds(renderer.frame) > SLOW_S for renderer in renderers]
-    times: list[list[tuple[float, float]]] = [[] for _ in rungs]
-    rng = np.random.default_rng(0)
-    for turn in range(rounds):
-        # In random order: caches depend on the previous call.
-        for k in rng.permutation(len(rungs)):
-            if turn < SLOW_ROUNDS or not slow[k]:
-                renderer = renderers[k]
-                times[k].append((seconds(renderer.frame), seconds(renderer.forward_backward)))
+    times = time_in_turns([(each.frame, each.forward_backward) for each in renderers], rounds)
     results = []
     for rung, count, spent in zip(rungs, operations, times, strict=True):
         images = [
@@ -330,7 +318,7 @@ def measure(
             AccuracyMeasurement(
                 subject.name,
                 rung.name,
-                *(1e3 * statistics.median(times) for times in zip(*spent, strict=True)),
+                *(1e3 * np.median(spent, axis=0)).tolist(),
                 operations=count,
                 psnr=quality.psnr,
                 ssim=quality.ssim,

@@ -8,7 +8,6 @@ reported. ``--without-avx512`` measures kernels compiled for AVX2.
 from __future__ import annotations
 
 import argparse
-import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ import numpy as np
 
 from drgs.bench.output import add_out, machine, markdown_table, write_rows
 from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, mitsuba_sensor
-from drgs.bench.timing import seconds
+from drgs.bench.timing import time_in_turns
 from drgs.cli.commands import CommandParser
 from drgs.config.schema import ModelConfig
 from drgs.core.private import disable_avx512
@@ -36,8 +35,6 @@ if TYPE_CHECKING:
 IMAGE_SIZE_PX = 400
 SHELL_STDS = 3.0  # extent of Mitsuba's ellipsoids, standard deviations (its default, and 3DGS's)
 ROUNDS, QUICK_ROUNDS = 15, 5
-SLOW_S, SLOW_ROUNDS = 0.5, 3
-VERY_SLOW_S = 15.0  # slower implementations are measured once
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,6 @@ class TimedRenderer:
     name: str
     forward: Callable[[], None]
     forward_backward: Callable[[], None]  # d sum(weights * image) / pixels by all parameters
-    seconds: float  # estimate, for both
 
 
 @dataclass(frozen=True)
@@ -121,13 +117,13 @@ class Problem:
 def drgs_renderer(problem: Problem) -> TimedRenderer:
     """Return the ``splats`` integrator, called by ``mi.render``."""
     scene = make_scene(problem.gaussians, ModelConfig().with_3dgs_defaults(), (1.0, 1.0, 1.0))
-    return _mitsuba_renderer("drgs", scene, problem, "integrator.", 0.1)
+    return _mitsuba_renderer("drgs", scene, problem, "integrator.")
 
 
-def volprim_renderer(problem: Problem, shape: str, seconds: float) -> TimedRenderer:
+def volprim_renderer(problem: Problem, shape: str) -> TimedRenderer:
     """Return Mitsuba's ``volprim_rf_basic`` on ``ellipsoids`` or ``ellipsoidsmesh``."""
     scene = mi.load_dict(volprim_scene(problem.gaussians, shape, 256))
-    return _mitsuba_renderer(f"volprim_rf_basic, {shape}", scene, problem, "shapes.", seconds)
+    return _mitsuba_renderer(f"volprim_rf_basic, {shape}", scene, problem, "shapes.")
 
 
 def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str, object]:
@@ -150,9 +146,7 @@ def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str,
     }
 
 
-def _mitsuba_renderer(
-    name: str, scene: mi.Scene, problem: Problem, prefix: str, seconds: float
-) -> TimedRenderer:
+def _mitsuba_renderer(name: str, scene: mi.Scene, problem: Problem, prefix: str) -> TimedRenderer:
     camera = problem.camera
     sensor = mi.load_dict(mitsuba_sensor(camera) | {"near_clip": 1e-3})
     params = mi.traverse(scene)
@@ -179,7 +173,7 @@ def _mitsuba_renderer(
         dr.sync_thread()
         dr.disable_grad(values)
 
-    return TimedRenderer(name, forward, forward_backward, seconds)
+    return TimedRenderer(name, forward, forward_backward)
 
 
 def reference_renderer(problem: Problem) -> TimedRenderer:
@@ -195,8 +189,7 @@ def reference_renderer(problem: Problem) -> TimedRenderer:
         reference.render(gaussians, problem.camera, white)
         reference.render_gradients(gaussians, problem.camera, white, d_image)
 
-    seconds = 6e-4 * len(gaussians.means)
-    return TimedRenderer("numpy reference, float64", forward, forward_backward, seconds)
+    return TimedRenderer("numpy reference, float64", forward, forward_backward)
 
 
 def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
@@ -204,37 +197,16 @@ def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
     rng = np.random.default_rng(0)
     weights = rng.normal(size=(scene.camera.height, scene.camera.width, 3))
     problem = Problem(scene.gaussians, scene.camera, weights)
-    count = scene.gaussians.num_gaussians
     renderers = [
         drgs_renderer(problem),
-        volprim_renderer(problem, "ellipsoids", 7e-5 * count),
-        volprim_renderer(problem, "ellipsoidsmesh", 1.5e-4 * count),
+        volprim_renderer(problem, "ellipsoids"),
+        volprim_renderer(problem, "ellipsoidsmesh"),
         reference_renderer(problem),
     ]
-    times: dict[str, list[tuple[float, float]]] = {r.name: [] for r in renderers}
-    for renderer in renderers:  # compiles the kernels
-        if renderer.seconds < VERY_SLOW_S:
-            renderer.forward_backward()
-            renderer.forward()
-    num_rounds = {
-        r.name: 1 if r.seconds > VERY_SLOW_S else SLOW_ROUNDS if r.seconds > SLOW_S else rounds
-        for r in renderers
-    }
-    for turn in range(rounds):
-        for renderer in renderers:
-            if turn < num_rounds[renderer.name]:
-                times[renderer.name].append(
-                    (seconds(renderer.forward), seconds(renderer.forward_backward))
-                )
+    times = time_in_turns([(each.forward, each.forward_backward) for each in renderers], rounds)
     return [
-        Timing(
-            scene.name,
-            name,
-            statistics.median(forward for forward, _ in pairs),
-            statistics.median(both for _, both in pairs),
-            len(pairs),
-        )
-        for name, pairs in times.items()
+        Timing(scene.name, renderer.name, *np.median(spent, axis=0).tolist(), len(spent))
+        for renderer, spent in zip(renderers, times, strict=True)
     ]
 
 
