@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import mitsuba as mi
 import numpy as np
 
@@ -84,15 +82,6 @@ def device_camera(camera: reference.Camera, float_type: type) -> Camera:
     return Camera.create(
         float_type, camera.rotation, camera.center, K, camera.width, camera.height, camera.near
     )
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Gaussians and a camera."""
-
-    name: str
-    gaussians: Gaussians  # numpy
-    camera: reference.Camera
 
 
 def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Camera]]:

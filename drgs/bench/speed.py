@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.bench.output import add_out, machine, markdown_table, write_rows
-from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, mitsuba_sensor
+from drgs.bench.scenes import bench_camera, bench_gaussians, mitsuba_sensor
 from drgs.bench.timing import time_in_turns
 from drgs.cli.commands import CommandParser
 from drgs.config.schema import ModelConfig
@@ -74,26 +74,37 @@ def run(args: argparse.Namespace) -> None:
         disable_avx512()
     print(machine() + (", without AVX-512" if args.without_avx512 else ""))
     timings: list[Timing] = []
-    for scene in make_scenes(args.trained, args.quick):
-        measured = measure_scene(scene, QUICK_ROUNDS if args.quick else ROUNDS)
+    for problem in make_problems(args.trained, args.quick):
+        measured = measure(problem, QUICK_ROUNDS if args.quick else ROUNDS)
         timings += measured
-        print(f"\n{scene.name}\n\n{comparison_table(measured)}", flush=True)
+        print(f"\n{problem.scene}\n\n{comparison_table(measured)}", flush=True)
     write_rows(args.out / "speed.csv", Timing, timings)
     *_, largest = (timing.scene for timing in timings if "trained" not in timing.scene)
     write_figure(args.out / "speed.png", plot([t for t in timings if t.scene == largest]))
 
 
-def make_scenes(trained: Path, quick: bool) -> list[Scene]:
+@dataclass(frozen=True)
+class Problem:
+    """A scene, the input of every implementation."""
+
+    scene: str
+    gaussians: Gaussians  # numpy
+    camera: reference.Camera
+    weights: np.ndarray  # (H, W, 3): the loss is sum(weights * image) / (H W)
+
+
+def make_problems(trained: Path, quick: bool) -> list[Problem]:
     """Return the bench scene at one or two sizes, and the trained one if it exists."""
-    camera = bench_camera(IMAGE_SIZE_PX)
     counts = (10_000,) if quick else (10_000, 100_000)
-    scenes = [Scene(f"bench scene, {n:,}", bench_gaussians(n), camera) for n in counts]
+    scenes = {f"bench scene, {n:,}": bench_gaussians(n) for n in counts}
     if trained.exists():
         gaussians = Gaussians.load(trained)
-        scenes.append(Scene(f"trained, {gaussians.num_gaussians:,}", gaussians, camera))
+        scenes[f"trained, {gaussians.num_gaussians:,}"] = gaussians
     else:
         print(f"{trained}: not there; fit a scene, or name one with --trained, to measure it")
-    return scenes
+    camera = bench_camera(IMAGE_SIZE_PX)
+    weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))
+    return [Problem(name, gaussians, camera, weights) for name, gaussians in scenes.items()]
 
 
 @dataclass(frozen=True)
@@ -103,15 +114,6 @@ class TimedRenderer:
     name: str
     forward: Callable[[], None]
     forward_backward: Callable[[], None]  # d sum(weights * image) / pixels by all parameters
-
-
-@dataclass(frozen=True)
-class Problem:
-    """The input of every implementation."""
-
-    gaussians: Gaussians  # numpy
-    camera: reference.Camera
-    weights: np.ndarray  # (H, W, 3): the loss is sum(weights * image) / (H W)
 
 
 def drgs_renderer(problem: Problem) -> TimedRenderer:
@@ -192,11 +194,8 @@ def reference_renderer(problem: Problem) -> TimedRenderer:
     return TimedRenderer("numpy reference, float64", forward, forward_backward)
 
 
-def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
+def measure(problem: Problem, rounds: int) -> list[Timing]:
     """Time all implementations, interleaved."""
-    rng = np.random.default_rng(0)
-    weights = rng.normal(size=(scene.camera.height, scene.camera.width, 3))
-    problem = Problem(scene.gaussians, scene.camera, weights)
     renderers = [
         drgs_renderer(problem),
         volprim_renderer(problem, "ellipsoids"),
@@ -205,7 +204,7 @@ def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
     ]
     times = time_in_turns([(each.forward, each.forward_backward) for each in renderers], rounds)
     return [
-        Timing(scene.name, renderer.name, *np.median(spent, axis=0).tolist(), len(spent))
+        Timing(problem.scene, renderer.name, *np.median(spent, axis=0).tolist(), len(spent))
         for renderer, spent in zip(renderers, times, strict=True)
     ]
 

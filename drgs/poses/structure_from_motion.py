@@ -306,22 +306,12 @@ class _Reconstruction:
                 reader.mask_path = masks
             self.watch("photograph", done, len(self.names))
             # In this order: threads would number the photographs in the order of their ends.
-            pycolmap.import_images(
-                self.database,
-                self.photographs,
-                image_names=group,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                options=reader,
-            )
+            mode = pycolmap.CameraMode.SINGLE
+            pycolmap.import_images(self.database, self.photographs, mode, group, reader)
             sizes = PHOTOGRAPHS_AT_ONCE, done, len(self.names)
             for chunk in self._chunks("photograph", group, *sizes):
                 pycolmap.extract_features(
-                    self.database,
-                    self.photographs,
-                    image_names=chunk,
-                    camera_mode=pycolmap.CameraMode.SINGLE,
-                    reader_options=reader,
-                    extraction_options=options,
+                    self.database, self.photographs, chunk, mode, reader, options
                 )
                 self._check_features(chunk)
             done += len(group)

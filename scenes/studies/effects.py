@@ -20,7 +20,6 @@ import mitsuba as mi
 import numpy as np
 from drgs.bench.output import columns_table, machine, write_rows
 from drgs.bench.scenes import (
-    Scene,
     bench_camera,
     bench_gaussians,
     mitsuba_pose,
@@ -29,7 +28,7 @@ from drgs.bench.scenes import (
 from drgs.bench.timing import count_operations, seconds
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
-from stages import trainer_of
+from stages import Scene, trainer_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -28,7 +28,7 @@ import drjit.llvm.ad as llvm
 import mitsuba as mi
 import numpy as np
 from drgs.bench.output import machine, markdown_table
-from drgs.bench.scenes import Scene, bench_camera, bench_gaussians
+from drgs.bench.scenes import bench_camera, bench_gaussians
 from drgs.bench.timing import seconds
 from drgs.core.private import disable_avx512
 from drgs.splatting.grid import PIXELS
@@ -36,6 +36,7 @@ from machine_code import MachineCodeError, assembly, count_operations, innermost
 from stages import (
     COPIES,
     STAGES,
+    Scene,
     StageClock,
     Work,
     clocked_step,

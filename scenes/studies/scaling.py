@@ -22,12 +22,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from drgs.bench.output import columns_table, machine, markdown_table
-from drgs.bench.scenes import Scene, bench_camera, bench_gaussians
+from drgs.bench.scenes import bench_camera, bench_gaussians
 from drgs.bench.timing import seconds
 from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.history import write_csv
-from stages import STAGES, Work, clocked_step, count_work, frame_of, steps, warm_trainer
+from stages import STAGES, Scene, Work, clocked_step, count_work, frame_of, steps, warm_trainer
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

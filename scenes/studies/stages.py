@@ -19,13 +19,14 @@ import drgs  # noqa: F401  (registers the plugins)
 import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
-from drgs.bench.scenes import Scene, device_camera
+from drgs.bench.scenes import device_camera
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.arrays import types_of
 from drgs.core.types import UInt32
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
+from drgs.reference import splatting as reference
 from drgs.splatting import rasterize, rendering, tiles
 from drgs.splatting.grid import PIXELS
 from drgs.splatting.lanes import Cursor, Entries, load_lane_row, make_lanes
@@ -107,6 +108,15 @@ def stage_clock() -> Iterator[StageClock]:
             timed = wrap(getattr(module, name), before, after)
             patches.enter_context(patch.object(module, name, timed))
         yield clock
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Gaussians and a camera."""
+
+    name: str
+    gaussians: Gaussians  # numpy
+    camera: reference.Camera
 
 
 def frame_of(scene: Scene) -> rendering.Frame:

@@ -46,7 +46,7 @@ def test_stability_finds_no_error_beyond_the_conditioning(tmp_path):
 
 def test_renderers_do_not_reuse_a_frame():
     mi.set_variant("llvm_ad_rgb")
-    problem = speed.Problem(bench_gaussians(500), bench_camera(48), np.ones((48, 48, 3)))
+    problem = speed.Problem("small", bench_gaussians(500), bench_camera(48), np.ones((48, 48, 3)))
     renderer = speed.drgs_renderer(problem)
     renderer.forward()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
