@@ -259,11 +259,6 @@ def test_few_photographs_are_matched_exhaustively_and_many_selectively(tmp_path)
         (SfmSettings(), ALL_PAIRS, "--share one or --camera-model SIMPLE_RADIAL or "),
         (SfmSettings(), ALL_PAIRS + 1, "--compare all or --share one"),
         (SfmSettings("SIMPLE_RADIAL", "all", "one"), 999, "--camera-model OPENCV_FISHEYE (a fish"),
-        (
-            SfmSettings("OPENCV_FISHEYE", "all", "one"),
-            9,
-            "--camera-model SIMPLE_RADIAL or --mapper",
-        ),
     ],
 )
 def test_offered_options_differ_from_the_given_ones(settings, count, options):
