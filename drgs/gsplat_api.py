@@ -339,15 +339,15 @@ class _Planes(dr.CustomOp):
     def backward(self) -> None:
         grad_out: Any = self.grad_out()  # as of :meth:`eval`
         all_d_planes, d_backgrounds = grad_out
-        found: dict[str, list] = {name: [] for name in self.inputs}
+        parts_by_name: dict[str, list] = {name: [] for name in self.inputs}
         for view, d_planes in zip(self.views, all_d_planes, strict=True):
             for name, gradient in view.gradients(d_planes).items():
-                found[name].append(gradient)
-            dr.eval(found)
+                parts_by_name[name].append(gradient)
+            dr.eval(parts_by_name)
         if d_backgrounds:
-            found["backgrounds"] = d_backgrounds
+            parts_by_name["backgrounds"] = d_backgrounds
         gradients = {}
-        for name, parts in found.items():
+        for name, parts in parts_by_name.items():
             shape, flat = self.inputs[name].shape, [cast(Float, dr.ravel(part)) for part in parts]
             is_shared = dr.width(flat[0]) == math.prod(shape)
             total = sum(flat[1:], flat[0]) if is_shared else dr.concat(flat)
@@ -397,10 +397,10 @@ class _View:
     def gradients(self, d_planes: list[Float]) -> dict[str, TensorXf | Float]:
         """Return gradients of the inputs from those of the planes."""
         dr.eval(d_planes)
-        found = frames_adjoint(
+        adjoint = frames_adjoint(
             self.gaussians, [self.frame], [d_planes], self.film.is_camera_attached
         )
-        d, t = found.parameters, self.types
+        d, t = adjoint.parameters, self.types
         assert d is not None and d.features is not None, "of self.gaussians, projected here"
         gradients: dict[str, TensorXf | Float] = {
             "means": d.means,
@@ -411,8 +411,8 @@ class _View:
             "viewmats": dr.zeros(t.Float, 16),
             "Ks": dr.zeros(t.Float, 9),
         }
-        if found.camera is not None:
-            gradients |= self._camera_gradients(np.array([number[0] for number in found.camera]))
+        if adjoint.camera is not None:
+            gradients |= self._camera_gradients(np.array([number[0] for number in adjoint.camera]))
         return gradients
 
     def _gaussians(self, values: Mapping[str, TensorXf]) -> Gaussians:
@@ -466,14 +466,14 @@ def _meta(views: list[_View]) -> dict[str, Any]:
         splats = view.pipeline.project(rows, view.frame.camera)
         brightness = dr.log(splats.opacities / ALPHA_CUT)
         radii = dr.ceil(dr.sqrt(2 * brightness * splats.variances))
-        found = {
+        values_by_name = {
             "means2d": list(splats.means2d),
             "depths": [splats.depths],
             "conics": list(splats.conics),
             "opacities": [splats.opacities],
             "radii": [dr.select(splats.visible, r, 0) for r in radii],
         }
-        for name, values in found.items():
+        for name, values in values_by_name.items():
             columns.setdefault(name, []).append(interleave(values))
     dr.eval(columns)
     film, num = views[0].film, views[0].gaussians.num_gaussians

@@ -162,9 +162,9 @@ def run(args: argparse.Namespace) -> None:
             flush=True,
         )
         rungs = [*RUNGS, *rungs_of_budgets(subject, args.error)]
-        found = measure(subject, accurate, rungs, QUICK_ROUNDS if args.quick else ROUNDS)
-        results += found
-        print(table(found), flush=True)
+        measured = measure(subject, accurate, rungs, QUICK_ROUNDS if args.quick else ROUNDS)
+        results += measured
+        print(table(measured), flush=True)
     write_rows(args.out / "accuracy.csv", AccuracyMeasurement, results)
     for subject, name in zip(subjects, PLOTS, strict=True):
         write_figure(args.out / name, plot([m for m in results if m.scene == subject.name]))

@@ -164,12 +164,12 @@ def _given_settings(args: argparse.Namespace) -> dict[str, object]:
 def _describe_cameras(settings: CaptureSettings, count: int) -> str:
     if settings.cameras == "sensors":
         return f"cameras: the scene's own sensors, {count}"
-    place = "around the scene"
+    where = "around the scene"
     if settings.cameras == "inside":
         assert settings.target is not None, "settings_for sets it"
         target = ", ".join(f"{value:.4g}" for value in settings.target)
-        place = f"inside the scene, around ({target})"
-    return f"cameras: {count} {place}, field of view {math.degrees(settings.fov):.4g} degrees"
+        where = f"inside the scene, around ({target})"
+    return f"cameras: {count} {where}, field of view {math.degrees(settings.fov):.4g} degrees"
 
 
 if __name__ == "__main__":

@@ -294,8 +294,8 @@ def _findings(fit: ShortFit) -> list[Finding]:
     looks = [_look_for_background]
     names = [*EFFECTS.shipped_names, *(e.name for e in EFFECTS.installed_extensions())]
     looks += [EFFECTS.get(name).value.look_for for name in names]
-    found = [look(fit) for look in looks]
-    return [finding for finding in found if finding is not None]
+    findings = [look(fit) for look in looks]
+    return [finding for finding in findings if finding is not None]
 
 
 def _look_for_background(fit: ShortFit) -> Finding | None:

@@ -72,7 +72,7 @@ class ExportTarget:
 
 def targets() -> dict[str, ExportTarget]:
     """Return the targets of ``--format`` by name: file formats, and the page."""
-    found = {
+    formats = {
         each.name: ExportTarget(
             suffix=each.value.suffix,
             text=each.value.description,
@@ -83,7 +83,7 @@ def targets() -> dict[str, ExportTarget]:
         )
         for each in writable_formats()
     }
-    return {**found, "html": PAGE, "mesh": MESH}
+    return {**formats, "html": PAGE, "mesh": MESH}
 
 
 def _page(source: ExportSource, out: Path) -> bytes:
@@ -227,20 +227,20 @@ def _destination(args: argparse.Namespace) -> tuple[ExportTarget, Path]:
         raise UserError(f"--mesh-size: is for --format mesh, got {name}; leave it out")
     if args.out is None:
         read_as = format_for(args.what)
-        place = args.what.resolve()
-        place = place.parent if _is_named(place, sog.META) else place
-        stem = args.what.name[: -len(read_as.value.suffix)] if read_as else place.name
+        path = args.what.resolve()
+        path = path.parent if _is_named(path, sog.META) else path
+        stem = args.what.name[: -len(read_as.value.suffix)] if read_as else path.name
         if args.levels is not None:
-            return target, place.with_name(f"{stem}_levels") / LOD_META
-        return target, place.with_name(f"{stem}{target.suffix}")
-    found = _target_name(args.out)  # as a.compressed.ply is no name for a plain PLY
-    if name == "mesh" and found in ("ply", "glb"):
-        return replace(target, has_axes=found == "glb"), args.out
-    if found != name:
+            return target, path.with_name(f"{stem}_levels") / LOD_META
+        return target, path.with_name(f"{stem}{target.suffix}")
+    named = _target_name(args.out)  # as a.compressed.ply is no name for a plain PLY
+    if name == "mesh" and named in ("ply", "glb"):
+        return replace(target, has_axes=named == "glb"), args.out
+    if named != name:
         ends = ".ply or .glb" if name == "mesh" else target.suffix
         raise UserError(
             f"--out {args.out}: the name of a {name} file must end in {ends}, got that of "
-            f"{f'a {found}' if found else 'no known'} file"
+            f"{f'a {named}' if named else 'no known'} file"
         )
     return target, args.out
 
@@ -265,8 +265,8 @@ def _target_name(path: Path) -> str | None:
         return "html"
     if _is_named(path, sog.META) or _is_named(path, LOD_META):
         return "sog"
-    found = format_for(path)
-    return None if found is None else found.name
+    file_format = format_for(path)
+    return None if file_format is None else file_format.name
 
 
 def _up_direction(

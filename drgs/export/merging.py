@@ -96,8 +96,8 @@ def _neighbours(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pairs a < b of nearest neighbours, each once, in order."""
     count = min(NUM_NEIGHBOURS + 1, len(means))
     near = KDTree(means).query(means, k=count)[1].reshape(len(means), count)
-    own = np.arange(len(means))[:, None]
-    pair = np.minimum(near, own) * len(means) + np.maximum(near, own)
+    index = np.arange(len(means))[:, None]
+    pair = np.minimum(near, index) * len(means) + np.maximum(near, index)
     a, b = np.divmod(np.unique(pair), len(means))
     return a[a < b], b[a < b]
 
@@ -121,11 +121,11 @@ def _disjoint_pairs(a: np.ndarray, b: np.ndarray, cost: np.ndarray, count: int) 
 
 def _squared_differences(values: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the sums (M,) of squared differences of pairs of rows, some pairs at a time."""
-    found = np.empty(len(a))
+    sums = np.empty(len(a))
     for start in range(0, len(a), PAIRS_AT_ONCE):
         part = slice(start, start + PAIRS_AT_ONCE)
-        found[part] = np.square(values[a[part]] - values[b[part]]).sum(axis=(1, 2))
-    return found
+        sums[part] = np.square(values[a[part]] - values[b[part]]).sum(axis=(1, 2))
+    return sums
 
 
 def _mix(values: np.ndarray, a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
