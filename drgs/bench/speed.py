@@ -203,10 +203,11 @@ def measure(problem: Problem, rounds: int) -> list[Timing]:
         reference_renderer(problem),
     ]
     times = time_in_turns([(each.forward, each.forward_backward) for each in renderers], rounds)
-    return [
-        Timing(problem.scene, renderer.name, *np.median(spent, axis=0).tolist(), len(spent))
-        for renderer, spent in zip(renderers, times, strict=True)
-    ]
+    timings = []
+    for renderer, spent in zip(renderers, times, strict=True):
+        forward, both = np.median(spent, axis=0).tolist()
+        timings.append(Timing(problem.scene, renderer.name, forward, both, len(spent)))
+    return timings
 
 
 def comparison_table(timings: list[Timing]) -> str:
