@@ -28,7 +28,6 @@ from scipy.sparse.csgraph import connected_components
 
 from drgs.core.environment import require_module
 from drgs.core.errors import UserError, UserNote, format_names, one_line
-from drgs.core.files import refusal_reason
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.colmap import find_model
 from drgs.datasets.files import is_image, masks_of, without_masks
@@ -188,10 +187,6 @@ def reconstruct(folder: Path, settings: SfmSettings, replace: bool, watch: Progr
                     watch=watch,
                 )  # fmt: skip
                 _install_model(Path(temporary, "model"), model)
-        except BrokenPipeError:  # of the output, whose reader has gone
-            raise
-        except OSError as error:
-            raise UserError(f"{model}: cannot write the model: {refusal_reason(error)}") from None
         except ChildEndedError as error:
             raise UserError(
                 f"{photographs}: structure from motion was ended: {error}; {REMEDY}"
