@@ -163,7 +163,7 @@ SCALED = {
 
 def own_sensor(kind, view) -> dict:
     aperture = {"fov": view.fov, "aperture_radius": 0.125, "focus_distance": 3.0}
-    return view.sensor_like(kind, **(aperture if kind == "thinlens" else {}))
+    return view.with_sensor(kind, **(aperture if kind == "thinlens" else {})).sensor()
 
 
 def own_camera(view) -> reference.Camera:
