@@ -50,20 +50,11 @@ class Calibrated:
         return {} if isinstance(self.lens, Equirectangular) else numbers
 
     def dictionary(self, **others) -> dict:
-        common = self.view.sensor()
-        kind = KINDS[type(self.lens)]
-        moves = {} if self.close is None else {"to_world_close": transform(self.close)}
-        return {
-            "type": "calibrated",
-            "lens": kind,
-            **self.intrinsics,
-            **self.coefficients,
-            **{name: common[name] for name in ("near_clip", "to_world", "film", "sampler")},
-            **moves,
-            "shutter": self.shutter,
-            "shutter_samples": SHUTTER_SAMPLES,
-            **others,
-        }
+        given = {"lens": KINDS[type(self.lens)], **self.intrinsics, **self.coefficients}
+        given |= {"shutter": self.shutter, "shutter_samples": SHUTTER_SAMPLES}
+        if self.close is not None:
+            given["to_world_close"] = transform(self.close)
+        return self.view.with_sensor("calibrated", **given | others).sensor()
 
     def load(self, **others) -> mi.Sensor:
         return mi.load_dict(self.dictionary(**others))
