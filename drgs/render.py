@@ -5,8 +5,8 @@
 load Python plugins). Cameras of Gaussians are the photographs' (``--split``, with metrics), an
 orbit (``--orbit``), a file's (``--camera``) or one (``--origin``).
 
-Writes a PNG per image, and ``metrics.json`` (``--split``), ``orbit.webp`` and ``orbit.gif``
-(``--orbit``), or an EXR per image (scenes).
+Writes a PNG per image, and ``metrics.json`` (``--split``) or ``orbit.webp`` (``--orbit``), or an
+EXR per image (scenes).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ from drgs.io.images import (
     write_exr,
 )
 from drgs.io.scenes import load_scene_file
-from drgs.results.files import CAMERAS, CONFIG, ERROR_BUDGET, METRICS, ORBIT, ORBIT_GIF
+from drgs.results.files import CAMERAS, CONFIG, ERROR_BUDGET, METRICS, ORBIT
 from drgs.results.metrics import Quality, mean_of, psnr, ssim
 from drgs.results.model import (
     BUDGET_KEY,
@@ -318,7 +318,7 @@ def render_orbit(model: Model, args: argparse.Namespace, folder: ImageFolder) ->
     viewpoints = orbit.viewpoints(args.orbit, width, height, fov)
     if args.panorama:
         viewpoints = [panorama(view, orbit.up) for view in viewpoints]
-    images = render_cameras(model, viewpoints, folder, [ORBIT, ORBIT_GIF])
+    images = render_cameras(model, viewpoints, folder, [ORBIT])
     write_animation(folder.path / ORBIT, images)
 
 

@@ -1,15 +1,14 @@
 """All images that drgs reads from files or writes to files.
 
 Read: 8 bits, with and without alpha, and grey of 16 bits; of colours of 16 bits, the upper 8.
-Written, whole or not at all: 8-bit PNG and WebP, animations as WebP and GIF, Mitsuba's bitmaps as
-EXR. Images are (H, W, C) in display space, rounded to 8 bits and clamped to [0, 1] here.
+Written, whole or not at all: 8-bit PNG and WebP, animations as WebP, Mitsuba's bitmaps as EXR.
+Images are (H, W, C) in display space, rounded to 8 bits and clamped to [0, 1] here.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,7 +54,7 @@ MAX_WEBP_SIDE = 16_383  # px: the largest width and height that the format can e
 
 MAX_FRAMES_BYTES = 2 << 30  # all frames of an animation, which are held until it is written
 
-FRAME_MS = 70  # 60 frames turn once in 4.2 s; GIF has steps of 10 ms
+FRAME_MS = 70  # 60 frames turn once in 4.2 s
 
 WEBP_QUALITIES, WEBP_BYTES = (80, 60, 40, 20), 1_500_000
 """The first quality is used that keeps an animation within so many bytes, or else the last."""
@@ -67,10 +66,6 @@ pixels: a flat background."""
 LOSSLESS_STEP = 255 / 31
 """Levels of 255 between two values of a channel without loss: a smaller error than that of lossy
 coding, which halves the resolution of colours, and two thirds of the bytes."""
-
-GIF_WIDTH = 300  # px: a GIF needs about five times the bytes of a WebP of the same size
-
-NEAR_BACKGROUND = 8  # levels of 255: nearer colours of a GIF's palette become the background's
 
 
 # Reading: by Pillow itself, which reads an image's mode and size before decoding it
@@ -246,7 +241,7 @@ def _open_image(path: Path) -> Iterator[ImageFile.ImageFile]:
         raise UserError(f"{path}: cannot read the image: {reason}") from None
 
 
-# Writing: by imageio, but for the palette that all frames of a GIF share
+# Writing: by imageio
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
@@ -306,23 +301,15 @@ def check_animation(frames: int, width: int, height: int) -> None:
 
 
 def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
-    """Write ``path``, an animated WebP that loops, and beside it a GIF of at most 300 px width.
-
-    The GIF is for mail, slides and old viewers. frames: at least one, of one size,
-    in 0..1 or uint8.
-    """
-    large = np.stack([to_uint8(frame) for frame in frames])
-    with ThreadPoolExecutor(1) as pool:
-        writing = pool.submit(_write_gif, path.with_suffix(".gif"), large)
-        data = _encode_lossless(large)
-        if data is None:
-            for quality in WEBP_QUALITIES:
-                data = encode(large, "webp", quality=quality, method=3, duration=FRAME_MS, loop=0)
-                if len(data) <= WEBP_BYTES:
-                    break
-        assert data is not None, "there is at least one quality"
-        _write(path, data)
-        writing.result()
+    """Write an animated WebP that loops; frames: at least one, of one size, in 0..1 or uint8."""
+    stack = np.stack([to_uint8(frame) for frame in frames])
+    data = _encode_lossless(stack)
+    for quality in WEBP_QUALITIES if data is None else ():
+        data = encode(stack, "webp", quality=quality, method=3, duration=FRAME_MS, loop=0)
+        if len(data) <= WEBP_BYTES:
+            break
+    assert data is not None, "there is at least one quality"
+    _write(path, data)
 
 
 def _encode_lossless(frames: np.ndarray) -> bytes | None:
@@ -358,33 +345,6 @@ def _commonest_color(pixels: np.ndarray) -> tuple[np.ndarray, float]:
     most = numbers[np.argmax(counts)]
     color = np.array([most >> 16, most >> 8 & 255, most & 255], np.uint8)
     return color, float(counts.max() / counts.sum())
-
-
-def _write_gif(path: Path, large: np.ndarray) -> None:
-    frames = [Image.fromarray(frame) for frame in large]
-    if (width := large.shape[2]) > GIF_WIDTH:
-        size = GIF_WIDTH, max(1, round(large.shape[1] * GIF_WIDTH / width))
-        frames = [frame.resize(size, Image.Resampling.BOX) for frame in frames]
-    palette = _common_palette(frames)
-    first, *rest = [frame.quantize(palette=palette) for frame in frames]
-    options = {"append_images": rest, "duration": FRAME_MS, "loop": 0, "optimize": False}
-    with atomic_path(path) as temporary:
-        first.save(temporary, "GIF", save_all=True, **options)
-
-
-def _common_palette(frames: Sequence[Image.Image]) -> Image.Image:
-    """Return 256 colours for all frames; the commonest, the background, is kept exactly.
-
-    Pillow looks colours up in cells of 4 levels, so that any palette colour near the background's
-    would be taken for it: those are replaced by it.
-    """
-    strip = np.concatenate([np.asarray(frame) for frame in frames[:: len(frames) // 8 or 1]])
-    background, _ = _commonest_color(strip)
-    palette = Image.fromarray(strip).quantize(256, method=Image.Quantize.MEDIANCUT)
-    values = np.array(palette.getpalette(), np.int64).reshape(-1, 3)
-    values[np.abs(values - background).max(axis=1) <= NEAR_BACKGROUND] = background
-    palette.putpalette(values.ravel().tolist())
-    return palette
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -35,17 +35,11 @@ def test_compression_leaves_a_flat_background_clean(tmp_path, background):
         frames.append(alpha * rng.uniform(size=(64, 600, 3)) + (1 - alpha) * color)
     for name in ("a", "b"):
         images.write_animation(tmp_path / f"{name}.webp", frames)
-    for suffix in (".webp", ".gif"):  # the same bytes
-        first, second = ((tmp_path / f"{name}{suffix}").read_bytes() for name in "ab")
-        assert first == second
+    assert (tmp_path / "a.webp").read_bytes() == (tmp_path / "b.webp").read_bytes()
     for frame, expected in zip(frames_of(tmp_path / "a.webp"), frames, strict=True):
         empty = (expected == color).all(axis=2)
         assert (frame[empty] == background).all()
         assert np.abs(frame / 255 - expected).max() <= (images.LOSSLESS_STEP + 1) / 2 / 255
-    small = frames_of(tmp_path / "a.gif")
-    assert len(small) == 5
-    for frame in small:
-        assert frame.shape[1] == images.GIF_WIDTH and frame[-1, -1].tolist() == list(background)
 
 
 def test_a_large_animation_is_written_at_a_lower_quality(tmp_path, monkeypatch):
