@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from drgs.core.errors import UserError, UserNote, one_line
-from drgs.core.files import open_regular
+from drgs.core.files import open_regular, refuse_damage
 from drgs.core.memory import available_memory, format_bytes, require_memory
 from drgs.datasets.storage import MEMORY, Decode, DiskStore, MemoryStore, is_on_disk
 from drgs.datasets.types import LazyImage, Pixels, View
@@ -105,14 +105,8 @@ def is_array(path: Path) -> bool:
 def _stored_depth(path: Path) -> np.ndarray:
     """Return the array (H, W) of an ``.npy`` file, mapped into memory."""
     open_regular(path, "depth", MAX_BYTES).close()
-    try:
-        with np.errstate(over="ignore"):  # of the size that a header claims
-            depth = np.load(path, mmap_mode="r", allow_pickle=False)
-    except MemoryError:
-        raise
-    except Exception as error:  # numpy raises many types for a broken header
-        reason = one_line(error) or type(error).__name__
-        raise UserError(f"{path}: cannot read the depth: {reason}") from None
+    with refuse_damage(f"{path}: cannot read the depth"), np.errstate(over="ignore"):
+        depth = np.load(path, mmap_mode="r", allow_pickle=False)
     is_real = isinstance(depth, np.ndarray) and depth.dtype.kind in "fiu"
     shape = depth.shape if is_real else ()
     if len(shape) == 2 or (len(shape) == 3 and shape[2] == 1):

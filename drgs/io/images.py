@@ -19,7 +19,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageCms, ImageFile, PngImagePlugin, UnidentifiedImageError
 
 from drgs.core.errors import UserError, one_line
-from drgs.core.files import atomic_path, open_regular
+from drgs.core.files import atomic_path, open_regular, refuse_damage
 from drgs.core.memory import require_memory
 
 if TYPE_CHECKING:
@@ -226,19 +226,17 @@ def _check_supported(path: Path, image: Image.Image) -> None:
 @contextmanager
 def _open_image(path: Path) -> Iterator[ImageFile.ImageFile]:
     """Open an image without decoding it; errors within the block become the user's."""
-    try:
-        with open_regular(path, "image", MAX_BYTES) as file, Image.open(file) as image:
+    where = f"{path}: cannot read the image"
+    with open_regular(path, "image", MAX_BYTES) as file, refuse_damage(where):
+        try:
+            image = Image.open(file)
+        except UnidentifiedImageError:
+            raise UserError(
+                f"{where}: it is of no format that is read, such as PNG, JPEG, TIFF or WebP; "
+                "convert it"
+            ) from None
+        with image:
             yield image
-    except (UserError, MemoryError):
-        raise
-    except UnidentifiedImageError:
-        raise UserError(
-            f"{path}: cannot read the image: it is of no format that is read, such as PNG, JPEG, "
-            "TIFF or WebP; convert it"
-        ) from None
-    except Exception as error:  # Pillow raises many types for a broken file
-        reason = getattr(error, "strerror", None) or one_line(error) or type(error).__name__
-        raise UserError(f"{path}: cannot read the image: {reason}") from None
 
 
 # Writing: by imageio

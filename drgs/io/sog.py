@@ -23,8 +23,7 @@ import json
 import math
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -35,7 +34,7 @@ from scipy.cluster.vq import kmeans2
 from typing_extensions import override
 
 from drgs.core.errors import UserError, one_line
-from drgs.core.files import open_regular, read_bytes
+from drgs.core.files import open_regular, read_bytes, refuse_damage
 from drgs.core.memory import require_memory
 from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
 from drgs.io.glb import validate_part
@@ -225,25 +224,13 @@ class _Meta(_Part):
     antialias: bool = False
 
 
-@contextmanager
-def _refuse_damage(path: Path, name: str) -> Iterator[None]:
-    """Turn the many errors of zipfile, zlib and Pillow for a broken file into the user's."""
-    try:
-        yield
-    except (UserError, MemoryError):
-        raise
-    except Exception as error:
-        reason = one_line(error) or type(error).__name__
-        raise UserError(f"{path}: cannot read {one_line(name, 60)}: {reason}") from None
-
-
 def _load(path: Path, name: str) -> bytes:
     """Return a file of the archive, or beside its meta.json."""
     if path.name.lower() == META:
         return read_bytes(path if name == META else path.with_name(name), "file", MAX_BYTES)
     with (
         open_regular(path, "file", MAX_BYTES) as file,
-        _refuse_damage(path, name),
+        refuse_damage(f"{path}: cannot read {one_line(name, 60)}"),
         zipfile.ZipFile(file) as archive,
     ):
         require_memory(path, archive.getinfo(name).file_size, name)
@@ -254,7 +241,7 @@ def _pixels(path: Path, name: str, least: int, width: int | None = None) -> np.n
     """Return the first pixels (N, 4) uint8 of an image, row by row; width: None: any."""
     content, most = _load(path, name), 2 * least + MAX_PALETTE
     with (
-        _refuse_damage(path, name),
+        refuse_damage(f"{path}: cannot read {one_line(name, 60)}"),
         Image.open(io.BytesIO(content), formats=["WEBP", "PNG"]) as image,
     ):
         if not least <= image.width * image.height <= most or image.width != (width or image.width):
