@@ -37,7 +37,7 @@ from drgs.datasets.images import (
 )
 from drgs.datasets.notices import Notices
 from drgs.datasets.splits import Lists, split_of
-from drgs.datasets.storage import Decode, MemoryStore
+from drgs.datasets.storage import MemoryStore
 from drgs.datasets.transforms import (
     CLOSE_POSE_KEY,
     TransformsFrame,
@@ -163,17 +163,15 @@ def load_views(
     def load(frame: TransformsFrame, name: str) -> View:
         file, is_read = frame.files["image"], keeps(name)
 
-        def decode() -> np.ndarray:
-            return orient_as_calibrated(read_pixels(file), frame)
-
-        pixels = decode() if is_read else orient_as_calibrated(placeholder_pixels(file), frame)
+        pixels = read_pixels(file) if is_read else placeholder_pixels(file)
+        pixels = orient_as_calibrated(pixels, frame)
         if is_read:
             notices.inspect(file, pixels)
         height, width = pixels.shape[:2]
         size = downscaled_size(width, height, config.image_size)
         camera = intrinsics(frame, pixels.shape, size)  # first: raises for a wrong size
         image, alpha, mask, depth = (
-            _read_images(config, frame, pixels, decode, store)
+            _read_images(config, frame, pixels, store)
             if is_read
             else _unread_images(frame, pixels, size)
         )
@@ -277,14 +275,10 @@ def _read_images(
     config: DataConfig,
     frame: TransformsFrame,
     pixels: np.ndarray,
-    decode: Decode,
     store: MemoryStore,
 ) -> Images:
     files, stored, depth = frame.files, (pixels.shape[1], pixels.shape[0]), None
-    source = files["image"], decode
-    image, alpha = compact_photograph(
-        pixels, config.background_rgb, config.image_size, store, source
-    )
+    image, alpha = compact_photograph(pixels, config.background_rgb, config.image_size, store)
     mask = _mask(config, files["mask"], stored, store) if "mask" in files else None
     if "depth" in files:
         depth = read_depth(files["depth"], _depth_unit(frame), stored)

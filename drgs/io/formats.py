@@ -114,7 +114,6 @@ FORMATS: Registry[type[FileFormat]] = Registry(
         "sog": "drgs.io.sog",
         "glb": "drgs.io.glb",
         "splat": "drgs.io.splat",
-        "ksplat": "drgs.io.ksplat",
         "usd": "drgs.io.usd",
     },
 )
