@@ -33,11 +33,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.cluster.vq import kmeans2
 from typing_extensions import override
 
+from drgs.config.section import parse_json, validate
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular, read_bytes, refuse_damage
 from drgs.core.memory import require_memory
 from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
-from drgs.io.glb import validate_part
 from drgs.io.quantization import (
     drop_largest_component,
     logits_from_opacities,
@@ -79,12 +79,8 @@ class Sog(FileFormat):
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         """Return Gaussians, and whether ``antialiased``; of an archive or beside a meta.json."""
-        text = _load(path, META)
-        try:
-            content = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise UserError(f"{path}: {META} is not valid JSON: {one_line(error)}") from None
-        meta = validate_part(path, f"{META}: ", _Meta, content)
+        where = f"{path}: {META}: "
+        meta = validate(_Meta, parse_json(_load(path, META), where), where)
         num, degree = meta.count, meta.shN.bands if meta.shN else 0
         require_scene_memory(path, num, (degree + 1) ** 2)
         low, high = (_pixels(path, n, num)[:, :3].astype(np.uint16) for n in meta.means.files)

@@ -26,7 +26,16 @@ from drgs.core.errors import UserError, UserNote, one_line
 from drgs.core.files import refuse_damage
 from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD
-from drgs.io.formats import FORMATS, ORIGIN, UP, Arrays, FileFormat, Scalar, pop_origin
+from drgs.io.formats import (
+    FORMATS,
+    ORIGIN,
+    UP,
+    Arrays,
+    FileFormat,
+    Scalar,
+    check_range,
+    pop_origin,
+)
 from drgs.io.quantization import (
     log_scales_from_scales,
     logits_from_opacities,
@@ -170,12 +179,7 @@ def _read_attribute(
     if not len(rows) or num not in (None, len(rows)):
         expected = "at least one" if num is None else f"{num:,} of them"
         raise UserError(f"{place}: {name}: {expected} expected, got {len(rows):,}")
-    bad = np.argwhere(~((rows >= least) & (rows <= most)))
-    if len(bad):
-        raise UserError(
-            f"{place}: {name} of Gaussian {bad[0][0]} must be from {least:g} to {most:g}, got "
-            f"{rows[tuple(bad[0])]}"
-        )
+    check_range(place, name, rows, least, most)
     return rows
 
 

@@ -68,7 +68,7 @@ def diagonal(*values):
 
 
 REFUSED_FRAMES = [
-    ("frames", [], "frames must have at least one entry, got []"),
+    ("frames", [], "frames must have at least 1 item after validation, not 0, got []"),
     ("frames", 3, "frames must be a list, got 3"),
     ("frames", None, "frames is missing"),
     ("frames 1", 7, "frames[1] must be an object, got 7"),

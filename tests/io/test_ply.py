@@ -110,7 +110,7 @@ def test_infinite_logits_become_opacities_distinct_from_0_and_1(tmp_path):
     g.logit_opacities[:] = [0.5, np.inf, np.nan, np.nan, 1e30]
     g.save(path)
     with pytest.warns(UserNote):
-        message = "numbers must be finite: logit_opacities of Gaussian 2 is nan; remove it"
+        message = "logit_opacities of Gaussian 2 must be finite, got nan; correct or remove it"
         assert refusal(path) == message
     g.logit_opacities[2:4] = -np.inf, np.inf
     g.save(path)
