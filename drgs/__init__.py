@@ -25,10 +25,10 @@ from drgs.core import errors, llvm
 
 if TYPE_CHECKING:
     from drgs.datasets import load_dataset
+    from drgs.examine.examination import examine
+    from drgs.fit.session import train
     from drgs.gaussians.parameters import Gaussians
     from drgs.gsplat_api import rasterization
-    from drgs.training.examination import examine
-    from drgs.training.session import train
 
 __version__ = "0.1.0"
 
@@ -46,10 +46,10 @@ errors.show_causes_last()
 
 _MODULES = {
     "Gaussians": "drgs.gaussians.parameters",
-    "examine": "drgs.training.examination",
+    "examine": "drgs.examine.examination",
     "load_dataset": "drgs.datasets",
     "rasterization": "drgs.gsplat_api",
-    "train": "drgs.training.session",
+    "train": "drgs.fit.session",
 }
 
 

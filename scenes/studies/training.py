@@ -24,9 +24,9 @@ from drgs.config.changes import with_changes, with_iterations
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.datasets import load_dataset
+from drgs.fit.budget import STRATEGIES, Strategy, rehearse
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import initial_gaussians
-from drgs.training.budget import STRATEGIES, Strategy, rehearse
 from fits import SCENES, add_case_option, fit, fit_words, make_parser, write_curves
 
 if TYPE_CHECKING:

@@ -160,7 +160,7 @@ MODULES = {
     "fit": "drgs.fit",
     "render": "drgs.render",
     "poses": "drgs.poses.__main__",
-    "examine": "drgs.examination",
+    "examine": "drgs.examine.__main__",
     "export": "drgs.export",
     "view": "drgs.view",
     "capture": "drgs.capture.__main__",
