@@ -64,7 +64,7 @@ def test_too_large_files_are_refused_before_allocation(tmp_path, monkeypatch, ea
     tracemalloc.start()
     Gaussians.load(path)
     peak = tracemalloc.get_traced_memory()[1]
-    monkeypatch.setattr(memory, "UNASKED_FILE_BYTES", 0)
+    monkeypatch.setattr(memory, "UNCHECKED_FILE_BYTES", 0)
     monkeypatch.setattr(memory, "available_memory", lambda: 0.9 * peak)
     tracemalloc.reset_peak()
     assert " of memory, of which" in refusal(path)
