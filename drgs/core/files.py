@@ -176,8 +176,8 @@ def remove_temporaries_of(folder: Path, names: Iterable[str]) -> None:
     """Remove temporary files in ``folder`` for the files ``names``, unless their writers run."""
     wanted = {(shorten_stem(path.stem), path.suffix) for path in map(Path, names)}
     for path in folder.glob(".*.tmp*"):
-        found = _TEMPORARY_NAME.fullmatch(path.name)
-        if found and (found[1], found[3] or "") in wanted and not psutil.pid_exists(int(found[2])):
+        match = _TEMPORARY_NAME.fullmatch(path.name)
+        if match and (match[1], match[3] or "") in wanted and not psutil.pid_exists(int(match[2])):
             with suppress(OSError):
                 path.unlink()
 

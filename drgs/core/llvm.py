@@ -80,14 +80,14 @@ def installed_libraries() -> list[tuple[Version, str]]:
 
     Versions come from file names: loading is slow, and two libLLVM in one process conflict.
     """
-    found = set()
+    libraries = set()
     for folder in _library_folders():
         for name in glob(os.path.join(folder, "libLLVM*")):
             version = version_from_name(name)
             if version is not None and os.path.isfile(name):
-                found.add((version, name))
+                libraries.add((version, name))
 
-    return sorted(found, key=lambda item: (item[0], len(item[1])), reverse=True)
+    return sorted(libraries, key=lambda item: (item[0], len(item[1])), reverse=True)
 
 
 def library_file() -> str | None:

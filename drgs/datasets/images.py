@@ -181,9 +181,9 @@ def _average_rows(image: np.ndarray, count: int) -> np.ndarray:
         return total / np.float32(factor)
     edges = np.union1d(np.arange(length + 1), np.arange(1, count) * (length / count))
     middles = (edges[1:] + edges[:-1]) / 2  # of parts that are in one old and in one new pixel
-    place = (middles * count / length).astype(np.int64), middles.astype(np.int64)
+    cells = (middles * count / length).astype(np.int64), middles.astype(np.int64)
     shares = np.diff(edges) * (count / length)
-    weights = sparse.csr_array((shares.astype(np.float32), place), (count, length))
+    weights = sparse.csr_array((shares.astype(np.float32), cells), (count, length))
     return (weights @ image.reshape(length, -1)).reshape(count, *image.shape[1:])
 
 

@@ -42,11 +42,11 @@ class Notices:
     ) -> None:
         """Emit ``notes`` and the findings, each as a :class:`UserNote`."""
         files = {path for view in (*train, *test) for path in view.files.values()}
-        own = [f"photographs {what}: {_format_files(n)}" for what, n in self._findings.items()]
+        texts = [f"photographs {what}: {_format_files(n)}" for what, n in self._findings.items()]
         if outside := self._files_outside(files if cloud is None else {*files, cloud}):
-            own.append(f"files from outside of the folder: {_format_files(outside)}")
-        own += self._duplicate_notes(train, test)
-        for note in (*notes, *(f"{self._folder}: {text}" for text in own)):
+            texts.append(f"files from outside of the folder: {_format_files(outside)}")
+        texts += self._duplicate_notes(train, test)
+        for note in (*notes, *(f"{self._folder}: {text}" for text in texts)):
             warnings.warn(UserNote(one_line(note, MAX_NOTE_CHARACTERS)), stacklevel=2)
 
     def _name(self, file: Path) -> str:
@@ -56,13 +56,13 @@ class Notices:
     def _files_outside(self, files: Iterable[Path]) -> list[str]:
         """Return files that lie elsewhere, by their names or by links."""
         root, folder_of = os.path.realpath(self._folder), cache(os.path.realpath)
-        found = []
+        outside = []
         for file in files:
             real = os.path.join(folder_of(file.parent), file.name)
             real = os.path.realpath(file) if file.is_symlink() else real
             if os.path.commonpath([root, real]) != root:
-                found.append(real)
-        return found
+                outside.append(real)
+        return outside
 
     def _duplicate_notes(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
         """Return a note on duplicate photographs, or none."""

@@ -319,13 +319,13 @@ def describe_extras(
 ) -> tuple[tuple[str, ...], str]:
     """Return the names of ignored data (distortion, motion, masks, depth) and a description."""
     lenses = list(filter(None, map(lens_of, frames)))
-    found = {
+    data = {
         "distortion": [lens for lens in lenses if lens.distorts],
         "motion": [f for f in frames if f.values.transform_matrix_close is not None],
         "masks": [f for f in frames if f.values.mask_path],
         "depth": [f for f in frames if f.values.depth_file_path],
     }
-    ignored = tuple(k for k, have in found.items() if have and getattr(config, f"ignore_{k}"))
+    ignored = tuple(k for k, have in data.items() if have and getattr(config, f"ignore_{k}"))
     text = ""
     if names := sorted({lens.describe() for lens in lenses}):
         text += f"; lens {' and '.join(names)}" + " ignored" * ("distortion" in ignored)

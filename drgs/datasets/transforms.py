@@ -251,9 +251,9 @@ def read_transforms(path: Path) -> TransformsFile:
     meta = validate(Transforms, parse_json(text, f"{path}: "), f"{path}: ")
     top = {name: getattr(meta, name) for name in CameraValues.model_fields} | _extra(meta)
     frames = []
-    for index, own in enumerate(meta.frames):
-        inherited = {key: value for key, value in top.items() if getattr(own, key, None) is None}
-        values = own.model_copy(update=inherited)
+    for index, frame in enumerate(meta.frames):
+        inherited = {key: value for key, value in top.items() if getattr(frame, key, None) is None}
+        values = frame.model_copy(update=inherited)
         frames.append(TransformsFrame(values, path, f"frames[{index}].", inherited.keys()))
     names = {split: getattr(meta, f"{split}_filenames") for split in ("train", "val", "test")}
     lists = {split: listing for split, listing in names.items() if listing}
@@ -308,12 +308,12 @@ def frames_with_files(
             continue
         names = [getattr(frame.values, key) for frame in naming]
         places = [frame.location(key) for frame in naming]
-        found = find_files(config.path, meta.path, names, FILE_KINDS[what], places, notes)
+        existing = find_files(config.path, meta.path, names, FILE_KINDS[what], places, notes)
         kept = []
         for frame in frames:
             name = getattr(frame.values, key)
-            if name in found:
-                kept.append(replace(frame, files={**frame.files, what: found[name]}))
+            if name in existing:
+                kept.append(replace(frame, files={**frame.files, what: existing[name]}))
             elif name is None or what == "depth":
                 kept.append(frame)
         frames = kept
@@ -325,8 +325,8 @@ def find_point_cloud(config: DataConfig, meta: TransformsFile, notes: list[str])
     if meta.point_cloud is None or config.ignore_points:
         return None
     names, places = [meta.point_cloud], ["ply_file_path"]
-    found = find_files(config.path, meta.path, names, POINT_CLOUD, places, notes)
-    return found.get(meta.point_cloud)
+    existing = find_files(config.path, meta.path, names, POINT_CLOUD, places, notes)
+    return existing.get(meta.point_cloud)
 
 
 # Optics

@@ -78,9 +78,9 @@ def start_box_of(init: InitConfig, dataset: Dataset) -> Box | None:
         focus, distance = focus_of(dataset.train)
     except UserError:
         return reference
-    seen = distance * _half_width(dataset.train)
+    visible_width = distance * _half_width(dataset.train)
     is_near = np.abs(focus - reference.center).max() <= reference.half_extent
-    if is_near and FILL_RANGE[0] <= reference.half_extent / seen <= FILL_RANGE[1]:
+    if is_near and FILL_RANGE[0] <= reference.half_extent / visible_width <= FILL_RANGE[1]:
         return reference
     return focus_box(dataset.train)
 
@@ -109,12 +109,12 @@ def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Genera
     kept = np.empty((0, 3))
     for _ in range(MAX_BATCHES):
         points = focus + distance * _near_and_far(count, rng)
-        seen, clear = np.zeros(count, bool), np.ones(count, bool)
+        visible, clear = np.zeros(count, bool), np.ones(count, bool)
         for view in views:
             offsets = points - view.center
-            seen |= _in_image(points, view)
+            visible |= _in_image(points, view)
             clear &= np.einsum("ni,ni->n", offsets, offsets) >= (MIN_DISTANCE * distance) ** 2
-        kept = np.concatenate([kept, points[seen & clear]])
+        kept = np.concatenate([kept, points[visible & clear]])
         if len(kept) >= count:
             return kept[:count]
     raise UserError(
@@ -183,9 +183,9 @@ def check_box(box: Box, dataset: Dataset) -> None:
 
 def _coverage(points: np.ndarray, view: Viewpoint) -> float:
     """Return the share of an image's cells that contain points; lenses are taken for pinholes."""
-    seen = points[_in_image(points, view)]
+    visible = points[_in_image(points, view)]
     shown_by = view if is_panorama(view) else replace(view, lens=None)
-    u, v, _ = to_film(shown_by, to_camera(view, list(seen.T)))
+    u, v, _ = to_film(shown_by, to_camera(view, list(visible.T)))
     cells = np.floor(NUM_CELLS * np.stack([u / view.width, v / view.height]))
     return np.unique(cells, axis=1).shape[1] / NUM_CELLS**2
 

@@ -144,9 +144,9 @@ def format_for(path: str | Path) -> Extension[type[FileFormat]] | None:
     Installed packages are imported only if no shipped format has such a suffix.
     """
     for formats in (_shipped_formats, FORMATS.installed_extensions):
-        found = [each for each in formats() if Path(path).name.lower().endswith(each.value.suffix)]
-        if found:
-            return max(found, key=lambda each: len(each.value.suffix))
+        known = [each for each in formats() if Path(path).name.lower().endswith(each.value.suffix)]
+        if known:
+            return max(known, key=lambda each: len(each.value.suffix))
     return None
 
 

@@ -230,8 +230,8 @@ def _chunks(path: Path, content: bytes) -> tuple[bytes, bytes]:
     except struct.error:
         raise refused from None
     start = text + json_size + CHUNK.size
-    found = magic, version, length, json_kind, kind
-    if found != (MAGIC, VERSION, len(content), JSON, BINARY) or start + size > length:
+    header = magic, version, length, json_kind, kind
+    if header != (MAGIC, VERSION, len(content), JSON, BINARY) or start + size > length:
         raise refused
     return content[text : text + json_size], content[start : start + size]
 
@@ -371,17 +371,17 @@ class _Document:
 
 def _read_document(path: Path, text: bytes, binary: bytes) -> _Document:
     file = validate(_File, parse_json(text, f"{path}: the JSON part: "), f"{path}: ")
-    found = [
+    splats = [
         (mesh, index)
         for mesh, each in enumerate(file.meshes)
         for index, primitive in enumerate(each.primitives)
         if isinstance(known := primitive.get("extensions"), dict) and EXTENSION in known
     ]
-    if len(found) != 1:
+    if len(splats) != 1:
         raise UserError(
-            f"{path}: must have one primitive with {EXTENSION}, got {len(found) or 'none'}"
+            f"{path}: must have one primitive with {EXTENSION}, got {len(splats) or 'none'}"
         )
-    mesh, index = found[0]
+    mesh, index = splats[0]
     place = f"meshes[{mesh}].primitives[{index}]"
     primitive = validate(_Primitive, file.meshes[mesh].primitives[index], f"{path}: {place}.")
     missing = [name for name in REQUIRED if name not in primitive.attributes]
@@ -397,10 +397,10 @@ def _translation(path: Path, nodes: list[_Node], mesh: int) -> tuple[float, floa
     if len(showing) > 1:
         raise UserError(f"{path}: the splats must be shown once, got {len(showing)} nodes")
     parents = {child: index for index, node in enumerate(nodes) for child in node.children}
-    seen, total = set(), (0.0, 0.0, 0.0)
-    while showing and showing[0] not in seen:
+    visited, total = set(), (0.0, 0.0, 0.0)
+    while showing and showing[0] not in visited:
         index = showing[0]
-        seen.add(index)
+        visited.add(index)
         moved = [n for n, same in IDENTITY.items() if getattr(nodes[index], n) != same]
         if moved:
             raise UserError(

@@ -125,15 +125,15 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 def unused_content(path: Path) -> list[str]:
     """Describe content of an image that :func:`read_pixels` does not use; from its header."""
     with _open_image(path) as image:
-        found = []
+        notes = []
         if _bits(image) > BITS.get(image.mode, 8):
-            found.append(f"of {_bits(image)} bits a channel, of which 8 are used")
+            notes.append(f"of {_bits(image)} bits a channel, of which 8 are used")
         if profile := _colour_profile(image.info.get("icc_profile")):
-            found.append(f"with the colour profile {profile}, which is not applied")
+            notes.append(f"with the colour profile {profile}, which is not applied")
         # The other images of an MPO are smaller ones, or for bright displays.
         if image.format != "MPO" and getattr(image, "n_frames", 1) > 1:
-            found.append("with several images each, of which the first is used")
-        return found
+            notes.append("with several images each, of which the first is used")
+        return notes
 
 
 def _bits(image: ImageFile.ImageFile) -> int:

@@ -303,19 +303,19 @@ def _refuse_end(name: str, promised: int, got: int) -> NoReturn:
 
 
 def _statements(path: str | Path, lines: list[bytes]) -> dict[str, Scalar]:
-    found: dict[str, str] = {}
+    values: dict[str, str] = {}
     comments = [line.removeprefix(b"comment ") for line in lines if line.startswith(b"comment ")]
     texts = [comment.decode("ascii", "replace").strip() for comment in comments]
     for match in filter(None, map(STATEMENT.fullmatch, texts)):
         name, text = match.groups()
-        if found.setdefault(name, text) != text:
+        if values.setdefault(name, text) != text:
             raise UserError(
-                f"{path}: the header's comments must give {name} once, got {found[name]} and "
+                f"{path}: the header's comments must give {name} once, got {values[name]} and "
                 f"{text}; remove one of the lines"
             )
     if any(map(ANTIALIASED.fullmatch, texts)):
-        found.setdefault("antialiased", "true")
-    return {name: _scalar(text) for name, text in found.items()}
+        values.setdefault("antialiased", "true")
+    return {name: _scalar(text) for name, text in values.items()}
 
 
 def _scalar(text: str) -> Scalar:

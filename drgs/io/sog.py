@@ -309,7 +309,7 @@ def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return rows, np.arange(len(rows))
     centers, cells = _kmeans(rows, CELLS)
     members = [np.flatnonzero(cells == cell) for cell in range(CELLS)]
-    sizes = np.array([len(own) for own in members])
+    sizes = np.array([len(member) for member in members])
     spread = np.array([np.square(rows[m] - c).sum() for m, c in zip(members, centers, strict=True)])
     shares = spread / max(spread.sum(), np.finfo(np.float32).tiny)
     counts = np.minimum(sizes, 1)
@@ -320,9 +320,9 @@ def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     entries, labels, num = [], np.empty(len(rows), np.intp), 0
     for each, count in zip(members, counts, strict=True):
         if count:
-            found, labels[each] = _kmeans(rows[each], count)
+            centroids, labels[each] = _kmeans(rows[each], count)
             labels[each] += num
-            entries.append(found)
+            entries.append(centroids)
             num += count
     return np.concatenate(entries), labels
 
