@@ -119,7 +119,7 @@ class DatasetReader:
         views = dict(zip(used, views, strict=True))
         train, test = (tuple(views[i] for i in indices) for indices in (split.train, split.test))
         measured = () if split.name == "train" else test
-        notices.emit(photographs.notes, train, measured, photographs.point_cloud)
+        notices.emit(photographs.notes, train, measured)
         ignored, extras = describe_extras(config, frames)
         return Dataset(
             train=train,

@@ -122,35 +122,10 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return np.fliplr(pixels) if orientation in (2, 3, 6, 7) else pixels
 
 
-def unused_content(path: Path) -> list[str]:
-    """Describe content of an image that :func:`read_pixels` does not use; from its header."""
+def colour_profile(path: Path) -> str:
+    """Return the name of the colour profile, which is not applied; "": sRGB's, or none."""
     with _open_image(path) as image:
-        notes = []
-        if _bits(image) > BITS.get(image.mode, 8):
-            notes.append(f"of {_bits(image)} bits a channel, of which 8 are used")
-        if profile := _colour_profile(image.info.get("icc_profile")):
-            notes.append(f"with the colour profile {profile}, which is not applied")
-        # The other images of an MPO are smaller ones, or for bright displays.
-        if image.format != "MPO" and getattr(image, "n_frames", 1) > 1:
-            notes.append("with several images each, of which the first is used")
-        return notes
-
-
-def _bits(image: ImageFile.ImageFile) -> int:
-    """Return bits of a channel in the file; Pillow decodes colours to 8."""
-    if image.format == "TIFF":
-        return max(cast("TiffImageFile", image).tag_v2.get(ExifTags.Base.BitsPerSample, (8,)))
-    if image.format == "JPEG2000" or not image.tile:
-        return 8
-    args = image.tile[0].args
-    if image.format == "PPM" and isinstance(args, tuple) and isinstance(args[-1], int):
-        return args[-1].bit_length()
-    mode = args if isinstance(args, str) else str(args[0] if args else "")
-    return 16 if ";16" in mode else 8
-
-
-def _colour_profile(profile: bytes | None) -> str:
-    """Return the name of a profile of other colours than sRGB; "": there is none."""
+        profile = image.info.get("icc_profile")
     if not profile:
         return ""
     try:

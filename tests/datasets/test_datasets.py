@@ -266,18 +266,6 @@ def test_keys_of_other_layouts_are_reported_as_unread(blender):
     assert dataset.train[0].cx == 3
 
 
-def test_files_outside_of_the_folder_are_reported_once(photographs, tmp_path_factory):
-    elsewhere = tmp_path_factory.mktemp("elsewhere")
-    (photographs / "images" / "03.png").rename(elsewhere / "03.png")
-    (photographs / "images" / "03.png").symlink_to(elsewhere / "03.png")
-    expected = f"{photographs}: files from outside of the folder: 1 ({elsewhere / '03.png'})"
-    assert load_noting(photographs)[1] == [expected]
-    (photographs / "images").rename(elsewhere / "images")
-    (photographs / "images").symlink_to(elsewhere / "images")
-    (note,) = load_noting(photographs)[1]
-    assert "files from outside of the folder: 10 (" in note
-
-
 def test_equal_and_empty_photographs_are_reported(photographs):
     images = photographs / "images"
     (images / "05.png").write_bytes((images / "03.png").read_bytes())
