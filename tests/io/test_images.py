@@ -1,4 +1,4 @@
-"""Images and animations that are written, and notes on what is not read of others."""
+"""Images and animations that are written, and what is read of others."""
 
 import struct
 

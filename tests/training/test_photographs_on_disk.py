@@ -50,7 +50,7 @@ def write_photographs(folder: Path, channels=3, dtype=np.uint8, extras=False) ->
 
 
 FORMS = {
-    "decoded again": ({}, {}),
+    "as they are": ({}, {}),
     "of 16 bits": ({"dtype": np.uint16}, {}),
     "halved": ({}, {"image_size": 32}),
     "rounded to 16 bits": ({}, {"image_size": 40}),
@@ -94,7 +94,7 @@ def test_images_are_the_same_as_from_memory(tmp_path, made, data):
 SLOW_FITS = {
     "halved, with alpha, shifted": {},
     "masks and depths": {"loss": {"depth_weight": 0.5}, "coarse": [{"until": 6, "factor": 2}]},
-    "decoded again": {"optimizer": {"views_per_step": 4}},
+    "as they are": {"optimizer": {"views_per_step": 4}},
 }
 
 
