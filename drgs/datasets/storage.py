@@ -16,15 +16,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import psutil
 from typing_extensions import override
 
 from drgs.core.errors import UserError
 from drgs.core.files import refusal_reason
 from drgs.core.memory import format_bytes
 from drgs.datasets.types import LazyImage, Pixels, View
-
-FILE_SYSTEMS_IN_MEMORY = {"tmpfs", "ramfs"}
 
 LARGER_DISK = (
     "set TMPDIR to a folder of a larger disk or a smaller data.image_size, or use fewer of them"
@@ -42,7 +39,7 @@ class MemoryStore:
 
 
 class DiskStore(MemoryStore):
-    """Writes pixels to a temporary file of :func:`scratch_folder`."""
+    """Writes pixels to a temporary file in ``TMPDIR`` or else ``/var/tmp``."""
 
     is_on_disk = True
 
@@ -51,7 +48,9 @@ class DiskStore(MemoryStore):
 
         Raises :class:`UserError` unless a disk has room for them.
         """
-        self._folder, self._lock = scratch_folder(), threading.Lock()
+        # Many systems have /tmp in memory.
+        self._folder = Path(os.environ.get("TMPDIR", "/var/tmp"))
+        self._lock = threading.Lock()
         try:
             free = shutil.disk_usage(self._folder).free
             if num_bytes > free:
@@ -90,25 +89,6 @@ class DiskStore(MemoryStore):
 
 
 MEMORY = MemoryStore()
-
-
-def scratch_folder() -> Path:
-    """Return the folder of temporary files, or /var/tmp where that one is in memory.
-
-    Raises :class:`UserError` where both are.
-    """
-    folders = [Path(tempfile.gettempdir()), Path("/var/tmp")]
-    mounts = {Path(p.mountpoint): p.fstype for p in psutil.disk_partitions(all=True)}
-    for folder in folders:
-        place = folder.resolve()
-        if folder.is_dir() and not FILE_SYSTEMS_IN_MEMORY & {
-            next((mounts[above] for above in (place, *place.parents) if above in mounts), "")
-        }:
-            return folder
-    raise UserError(
-        f"{folders[0]}: is in memory, and photographs that do not fit there (data.in_memory) are "
-        "to be on a disk; set TMPDIR to a folder of one"
-    )
 
 
 def is_on_disk(view: View) -> bool:
