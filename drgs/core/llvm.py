@@ -22,7 +22,10 @@ from pathlib import Path
 
 MINIMUM_VERSION = 17  # first major version that compiles every kernel
 
-TESTED_VERSION = 19  # first major version that drgs is tested with
+HOW_TO_INSTALL = (
+    "Install one with pip install 'drgs[llvm]' (x86-64 Linux), apt-get install libllvm19 or brew "
+    "install llvm"
+)
 
 ENVIRONMENT_FOLDER = os.path.join(sys.prefix, "lib")  # of libraries that pip and conda install
 
@@ -146,27 +149,18 @@ def _library_folders() -> list[str]:
 
 
 def _refusal(version: Version | None) -> str:
-    found = "none that Dr.Jit can load" if version is None else format_version(version)
+    loaded = "none that Dr.Jit can load" if version is None else format_version(version)
     if version is None and (named := os.environ.get(PATH_VARIABLE)):
-        found += f" ({PATH_VARIABLE}={named})"
+        loaded += f" ({PATH_VARIABLE}={named})"
     message = (
-        f"drgs: libLLVM {MINIMUM_VERSION} or newer is needed ({TESTED_VERSION} is tested), found "
-        f"{found}. Install one with {_install_commands()}, or name its file in the environment "
-        f"variable {PATH_VARIABLE}"
+        f"drgs: libLLVM {MINIMUM_VERSION} or newer is needed, found {loaded}. {HOW_TO_INSTALL}, or "
+        f"name its file in the environment variable {PATH_VARIABLE}"
     )
     usable = [path for version, path in installed_libraries() if version[0] >= MINIMUM_VERSION]
     if usable:
         message += f"; here {PATH_VARIABLE}={usable[0]} would do"
         message += ", or 'import drgs' before drjit and mitsuba"
     return message + "."
-
-
-def _install_commands() -> str:
-    if sys.platform == "darwin":
-        return "'brew install llvm'"
-    system = f"'apt-get install libllvm{TESTED_VERSION}'"
-    has_wheel = sys.platform == "linux" and platform.machine() == "x86_64"
-    return f"\"pip install 'drgs[llvm]'\" or {system}" if has_wheel else system
 
 
 def format_version(version: Version) -> str:

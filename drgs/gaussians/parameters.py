@@ -211,9 +211,7 @@ class Gaussians(Generic[Tensor]):
         tensors = {name: upload(getattr(self, name)) for name in self._names}
         return cast("Gaussians[TensorXf]", replace(self, **tensors, features=features))
 
-    def _rotate(
-        self: Gaussians[np.ndarray], rotation: np.ndarray
-    ) -> Gaussians[np.ndarray]:
+    def _rotate(self: Gaussians[np.ndarray], rotation: np.ndarray) -> Gaussians[np.ndarray]:
         from drgs.gaussians.rotation import rotate_gaussians, to_float32
 
         parts = rotate_gaussians(self.means, self.quats, self.shN, rotation)

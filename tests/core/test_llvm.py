@@ -90,27 +90,24 @@ def test_usable_versions_pass(machine, monkeypatch, version):
 
 NONE = "found none that Dr.Jit can load"
 REFUSALS = [
-    ((16, 0, 6), [], {}, "found 16.0.6. Install one with \"pip install 'drgs[llvm]'\" or 'apt-get"),
-    ((16, 0, 6), [], {}, "install libllvm19', or name its file in the environment variable DRJIT_"),
-    ((16, 0, 6), [], {"platform": "darwin"}, "Install one with 'brew install llvm', or name"),
-    ((15, 0, 6), ["libLLVM.so.19.1"], {}, "; here DRJIT_LIBLLVM_PATH={}/libLLVM.so.19.1 would do,"),
-    ((15, 0, 6), ["libLLVM.so.19.1"], {}, " or 'import drgs' before drjit and mitsuba."),
-    (None, [], {}, f"{NONE}. Install one"),
-    (None, ["libLLVM-14.so.1"], {}, f"{NONE}. Install one"),
-    (None, [], {"variable": "/none.so"}, f"{NONE} (DRJIT_LIBLLVM_PATH=/none.so). Install one"),
+    ((16, 0, 6), [], "", "found 16.0.6. Install one with pip install 'drgs[llvm]'"),
+    ((16, 0, 6), [], "", "install llvm, or name its file in the environment variable DRJIT_"),
+    ((15, 0, 6), ["libLLVM.so.19.1"], "", "; here DRJIT_LIBLLVM_PATH={}/libLLVM.so.19.1 would do,"),
+    ((15, 0, 6), ["libLLVM.so.19.1"], "", " or 'import drgs' before drjit and mitsuba."),
+    (None, [], "", f"{NONE}. Install one"),
+    (None, ["libLLVM-14.so.1"], "", f"{NONE}. Install one"),
+    (None, [], "/none.so", f"{NONE} (DRJIT_LIBLLVM_PATH=/none.so). Install one"),
 ]
 
 
-@pytest.mark.parametrize(("version", "names", "more", "message"), REFUSALS)
-def test_unusable_libraries_are_refused(machine, monkeypatch, version, names, more, message):
+@pytest.mark.parametrize(("version", "names", "variable", "message"), REFUSALS)
+def test_unusable_libraries_are_refused(machine, monkeypatch, version, names, variable, message):
     folder = machine(*names)
-    monkeypatch.setattr(sys, "platform", more.get("platform", "linux"))
-    if "variable" in more:
-        monkeypatch.setenv(llvm.PATH_VARIABLE, more["variable"])
+    monkeypatch.setenv(llvm.PATH_VARIABLE, variable)
     monkeypatch.setattr(llvm, "loaded_version", lambda: version)
     with pytest.raises(llvm.LLVMVersionError) as error:
         llvm.ensure_usable_llvm()
-    assert str(error.value).startswith("drgs: libLLVM 17 or newer is needed (19 is tested), found ")
+    assert str(error.value).startswith("drgs: libLLVM 17 or newer is needed, found ")
     assert message.format(folder) in str(error.value)
 
 
@@ -139,6 +136,6 @@ def test_an_old_library_is_refused_when_an_llvm_variant_is_chosen(run_python, ma
     result = run_python(SET_VARIANT, DRJIT_LIBLLVM_PATH=found[0])
     assert result.returncode == 0, result.stderr
     refusal, variant, fallback = result.stdout.splitlines()
-    assert refusal.startswith("drgs: libLLVM 17 or newer is needed (19 is tested), found ")
+    assert refusal.startswith("drgs: libLLVM 17 or newer is needed, found ")
     assert f"found {major}" in refusal or found[0] in refusal
     assert (variant, fallback) == ("None", "scalar_rgb")
