@@ -93,7 +93,8 @@ def run(args: argparse.Namespace) -> None:
             page = Page(server, requests, start, scene.approximations)
             if len(views) > 1:
                 page.add_cameras(views, visible=False)
-            print(f"live view: {url(server)}", flush=True)
+            count = model.gaussians.num_gaussians
+            print(f"{count:,} Gaussians; live view: {url(server)}", flush=True)
             print("Ctrl-C ends this", flush=True)
             scheduler = RenderScheduler(requests, page.show, page.refuse)
             with StopRequest() as stop:
