@@ -5,8 +5,8 @@
 load Python plugins). Cameras of Gaussians are the photographs' (``--split``, with metrics), an
 orbit (``--orbit``), a file's (``--camera``) or one (``--origin``).
 
-Writes a PNG per image, and ``metrics.json`` (``--split``), ``orbit.webp`` and ``orbit.gif``
-(``--orbit``), or an EXR per image (scenes).
+Writes a PNG per image, and ``metrics.json`` (``--split``) or ``orbit.webp`` (``--orbit``), or an
+EXR per image (scenes).
 """
 
 from __future__ import annotations

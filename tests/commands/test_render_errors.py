@@ -212,7 +212,7 @@ VIEWS = {
         ("split", "r_1.png", ""),
         *(("split", "metrics.json", text) for text in ("[", "[]", '{"split": "test"}', "7")),
         ("orbit", "orbit_001.png", ""),
-        ("orbit", "orbit.gif", ""),
+        ("orbit", "orbit.webp", ""),
         ("origin", "camera.png", ""),
     ],
 )

@@ -131,7 +131,7 @@ def test_page_of_numbers_it_cannot_show_or_that_is_too_large_is_not_written(
     wrong.sh0[3, 0, 1] = np.nan
     assert viewer.shows_as_fitted(FITTED)
     assert not viewer.shows_as_fitted(replace(FITTED, order="pixel"))
-    with pytest.raises(UserError, match="sh0 of Gaussian 3 is"):
+    with pytest.raises(UserError, match="sh0 of Gaussian 3 must be finite"):
         viewer_page(TITLE, DisplaySettings(wrong, FITTED), initial_view, COLOR)
     monkeypatch.setattr(viewer, "MAX_PAGE_BYTES", viewer.estimate_page_bytes(30, 1) - 1)
     note = r"viewer\.html: not written, as it would have about 0 MB.*export .* --format html"
