@@ -19,7 +19,6 @@ TOLERANCE = 3e-5
 
 OWN_AOVS = "t:depth, a:alpha"
 
-
 LENS = {"fx": 40.0, "lens": "opencv", "k1": -0.1}
 THIN = {"fov": 50.0, "aperture_radius": 0.05, "focus_distance": 2.3}
 PLAIN = View("")

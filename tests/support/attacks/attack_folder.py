@@ -30,14 +30,7 @@ from support.attacks.attack import Fault, observed
 from support.commands import assert_ends_well, run_in_process
 from support.datasets import write_points
 from support.ksplat import content_of
-from support.small_capture import (
-    HEIGHT,
-    WIDTH,
-    blobs,
-    make_dataset,
-    pose_around,
-    write_dataset,
-)
+from support.small_capture import HEIGHT, WIDTH, blobs, make_dataset, pose_around, write_dataset
 
 SETTINGS = {
     "data": {"path": "lego"},
