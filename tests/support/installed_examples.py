@@ -18,7 +18,7 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 @contextmanager
 def installed_examples(*names: str) -> Iterator[dict[str, ModuleType]]:
-    """Within the block, entry points name these modules of ``examples/``; yields the modules."""
+    """Within the block, entry points name these modules of ``examples``; yields the modules."""
     points = [EntryPoint(name, name, registry.ENTRY_POINT_GROUP) for name in names]
     with (
         mock.patch.object(sys, "path", [str(EXAMPLES), *sys.path]),
