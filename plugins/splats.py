@@ -365,7 +365,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def _gather(self, scene: mi.Scene) -> None:
         self.state.gather(scene)
         if self.state.shadows:
-            from drgs.integrator.shadows import shade
+            from drgs.integrator.light.shadows import shade
 
             shade(self.state, scene)
         if self.state.error is not None and self.state.budget_report is None:

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from drgs.core.errors import UnsupportedError, format_names
 from drgs.integrator.checks import ellipsoids_in
-from drgs.integrator.rays import TransportIntegrator
+from drgs.integrator.light.rays import TransportIntegrator
 from drgs.integrator.state import SplatsState
 
 ATTACHED_INTEGRATORS = ("PathIntegrator", "DirectIntegrator")  # samples move with parameters

@@ -17,7 +17,7 @@ import mitsuba as mi
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.checks import check_image
 from drgs.integrator.film import CenterSamples
-from drgs.integrator.rays import TransportIntegrator
+from drgs.integrator.light.rays import TransportIntegrator
 from drgs.integrator.sensor_render import Planes, SensorRender, constant_background
 from drgs.integrator.sensors import is_batch, num_poses, sensors_of
 from drgs.integrator.state import SplatsState
@@ -146,7 +146,7 @@ def hybrid_of(
     """Return the surfaces in an image; None where the scene has none."""
     if all(shape.is_ellipsoids() for shape in scene.shapes()):
         return None
-    from drgs.integrator.rays import StraightRays
+    from drgs.integrator.light.rays import StraightRays
     from drgs.integrator.surfaces import Hybrid, Insertion, Surfaces
 
     cache, hide_emitters = splats.cache, splats.hide_emitters
@@ -166,7 +166,7 @@ def hybrid_of(
         if isinstance(nested, TransportIntegrator):
             nested.use_transport(None)  # another integrator may have given it one
     else:
-        from drgs.integrator.splat_transport import nested_with_transport
+        from drgs.integrator.light.splat_transport import nested_with_transport
 
         num_paths = splats.nested_spp or spp or sensor.sampler().sample_count()
         nested = adjoint = nested_with_transport(splats, scene, num_paths, sensors_of(sensor))

@@ -29,7 +29,7 @@ from drgs.core.origin import WORLD, format_origin
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.checks import check_shapes
-from drgs.integrator.rays import TransportIntegrator
+from drgs.integrator.light.rays import TransportIntegrator
 from drgs.integrator.state import AOVS, SplatObject, SplatsState, feature_widths
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given

@@ -10,7 +10,7 @@ sums of the colours and weights of the splats as far as surfaces let them throug
     A D(C / A) + sum_k T_k L_k + T (1 - sum_k p_k) B.
 
 With N_k the nested image from behind the first k surfaces, times their transmittance
-(``drgs.integrator.rays``), L_k = N_(k - 1) - N_k. Behind the last surface, N_k is (1 - sum_k p_k) B
+(``drgs.integrator.light.rays``), L_k = N_(k - 1) - N_k. Behind the last surface, N_k is (1 - sum_k p_k) B
 where the nested integrator shows the background, and else 0.
 
 Not differentiated: the depth of a surface, the part of a pixel that it covers, its silhouette.
@@ -32,7 +32,7 @@ from drgs.core.errors import PluginError, UnsupportedError, format_names, one_li
 from drgs.core.private import same_variables
 from drgs.integrator.derivatives import Parameter, attached_parameters, parameter_value, type_of
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors, pixels_adjoint
-from drgs.integrator.rays import (
+from drgs.integrator.light.rays import (
     UNBOUNDED_DEPTH,
     RaysBehind,
     StraightRays,

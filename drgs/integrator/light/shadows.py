@@ -24,8 +24,8 @@ from drgs.core.constants import SH_C0
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.integrator.checks import check_ids
-from drgs.integrator.rays import StraightRays, has_transparent_parts
-from drgs.integrator.splat_transport import ray_splats_of
+from drgs.integrator.light.rays import StraightRays, has_transparent_parts
+from drgs.integrator.light.splat_transport import ray_splats_of
 from drgs.integrator.state import SplatsState
 from drgs.integrator.surfaces import Surfaces, scene_of
 from drgs.light.walk import RaySplats, Segment

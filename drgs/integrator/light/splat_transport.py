@@ -42,7 +42,7 @@ from drgs.core.arrays import reinterpret
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.checks import check_ids
-from drgs.integrator.rays import PathSegment, SplatTransport, TransportIntegrator
+from drgs.integrator.light.rays import PathSegment, SplatTransport, TransportIntegrator
 from drgs.integrator.sensor_render import decode
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import SplatsState
@@ -52,7 +52,7 @@ from drgs.splatting.projection import load_rows
 from drgs.splatting.rendering import color_features, depth_feature
 
 if TYPE_CHECKING:
-    from drgs.integrator.mirrors import FlatMirror, Mirrors
+    from drgs.integrator.light.mirrors import FlatMirror, Mirrors
 else:  # Dr.Jit evaluates annotations
     Mirrors = object
 
@@ -319,7 +319,7 @@ def _warn_of_close(
 
 def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int, FlatMirror]:
     """Return flat mirrors among the shapes, by the probe's number."""
-    from drgs.integrator.mirrors import FlatMirror
+    from drgs.integrator.light.mirrors import FlatMirror
 
     def recognise() -> dict[int, FlatMirror]:
         every = {k: FlatMirror.from_shape(shape) for k, shape in shapes.items()}
@@ -331,7 +331,7 @@ def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int,
 def _mirror_images(
     splats: SplatsState, scene: mi.Scene, mirrors: list[FlatMirror], states: list[SensorState]
 ) -> Mirrors | None:
-    from drgs.integrator.mirrors import Mirrors
+    from drgs.integrator.light.mirrors import Mirrors
 
     gaussians, surfaces = dr.detach(splats.gaussians), splats.cache.surfaces
     if not mirrors or surfaces is None:
