@@ -140,7 +140,7 @@ class SplatsState:
     shadows: Sequence[str]
     exposure: float
     error: float | None  # budget of the approximations' error; None: as they are given
-    budget_report: Any = None  # drgs.integrator.error_budget.BudgetReport, once it was met
+    budget_report: Any = None  # drgs.accuracy.error_budget.BudgetReport, once it was met
     cache: RenderCache = field(default_factory=RenderCache)
     projection: rendering.ProjectionStage = field(default_factory=rendering.Projected)
 

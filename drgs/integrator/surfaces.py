@@ -10,8 +10,8 @@ sums of the colours and weights of the splats as far as surfaces let them throug
     A D(C / A) + sum_k T_k L_k + T (1 - sum_k p_k) B.
 
 With N_k the nested image from behind the first k surfaces, times their transmittance
-(``drgs.integrator.light.rays``), L_k = N_(k - 1) - N_k. Behind the last surface, N_k is (1 - sum_k p_k) B
-where the nested integrator shows the background, and else 0.
+(``drgs.integrator.light.rays``), L_k = N_(k - 1) - N_k. Behind the last surface, N_k is
+(1 - sum_k p_k) B where the nested integrator shows the background, and else 0.
 
 Not differentiated: the depth of a surface, the part of a pixel that it covers, its silhouette.
 """
