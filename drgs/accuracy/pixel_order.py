@@ -36,8 +36,15 @@ from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import Rows, scatter_rows, types_of
 from drgs.core.types import Bool, Float, UInt32
 from drgs.splatting.footprint import Alpha, Footprint, FootprintModel, flat_columns
-from drgs.splatting.grid import PIXELS, Lanes
-from drgs.splatting.lanes import group_by_work, load_lane_row, load_pixels, make_lanes, pixels_of
+from drgs.splatting.grid import (
+    PIXELS,
+    Lanes,
+    group_by_work,
+    load_lane_row,
+    load_pixels,
+    make_lanes,
+    pixels_of,
+)
 from drgs.splatting.projection import Projection, ProjectionModel, Splats2D, ewa
 from drgs.splatting.rasterize import (
     ONE_SAMPLE,

@@ -21,8 +21,8 @@ from drgs.bench.scenes import Scene, trainer_of
 from drgs.core.arrays import types_of
 from drgs.core.types import UInt32
 from drgs.splatting import rasterize, rendering, tiles
-from drgs.splatting.grid import PIXELS
-from drgs.splatting.lanes import Cursor, Entries, load_lane_row, make_lanes
+from drgs.splatting.grid import PIXELS, load_lane_row, make_lanes
+from drgs.splatting.tiles import Cursor, Entries
 from drgs.training.trainer import Trainer
 
 STAGES = (

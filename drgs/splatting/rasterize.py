@@ -58,12 +58,13 @@ from drgs.core.arrays import Rows, divide, quotient, reinterpret, scatter_rows, 
 from drgs.core.private import access_all_lanes
 from drgs.core.types import Array2f, Bool, Float, Int32, UInt32
 from drgs.splatting.footprint import Alpha, SplatFeatures
-from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
-from drgs.splatting.lanes import (
-    Cursor,
-    Entries,
-    EntriesBackToFront,
-    count_entries,
+from drgs.splatting.grid import (
+    GRID,
+    MICRO,
+    MICROS,
+    PIXELS,
+    TILE,
+    TileGrid,
     group_by_work,
     load_lane_row,
     load_pixels,
@@ -78,7 +79,7 @@ from drgs.splatting.reduction import (
     sum_entries,
     sum_runs,
 )
-from drgs.splatting.tiles import TileBins
+from drgs.splatting.tiles import Cursor, Entries, EntriesBackToFront, TileBins, count_entries
 
 
 @dataclass(frozen=True)

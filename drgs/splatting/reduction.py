@@ -22,8 +22,7 @@ from drgs.core.arrays import Rows, divide, interleave, repeat_array, types_of
 from drgs.core.private import access_all_lanes
 from drgs.core.types import Array2u, Bool, Float, UInt32
 from drgs.splatting.grid import MICROS
-from drgs.splatting.lanes import Entries, find_lowest_bit
-from drgs.splatting.tiles import WORD, TileBins, transpose_masks
+from drgs.splatting.tiles import WORD, Entries, TileBins, find_lowest_bit, transpose_masks
 
 BAND_SLOTS = 1 << 20
 """Slots of a band, as far as whole tiles allow: 38 MB, three colours in single precision.

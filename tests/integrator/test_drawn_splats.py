@@ -18,7 +18,7 @@ from drgs.integrator.light.splat_transport import (
     RayTransport,
 )
 from drgs.light.walk import _hashes
-from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.footprint import Cutoffs
 
 RAYS, PATHS = 4, 8192
 
