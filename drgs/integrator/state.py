@@ -52,7 +52,7 @@ class BackwardResult:
         times. Call it before a parameter changes.
         """
         sums = [rendering.weighted_sums(frame, plane)[0] for frame in self.frames]
-        return sum(sums[1:], sums[0]) / sum(frame.bins.grid.samples for frame in self.frames)
+        return sum(sums[1:], sums[0]) / sum(frame.tiles.bins.grid.samples for frame in self.frames)
 
 
 @dataclass(frozen=True, eq=False)

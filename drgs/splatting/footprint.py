@@ -388,6 +388,11 @@ class FeatureGroup:
     planes: list[int]  # indices of their planes; a plane may belong to several groups
     features: SplatFeatures
 
+    @property
+    def places(self) -> list[int]:
+        """Indices of all planes of the group, among those of the image: transmittance first."""
+        return [0, *(1 + plane for plane in self.planes)]
+
 
 @dataclass(frozen=True)
 class SplatFeatures:

@@ -41,11 +41,11 @@ class CompositedPairs:
     words: UInt32  # (S * M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
     row: UInt32  # (S * M + 1,): unsorted -> row of sums, or of the next entry that is seen
     first_row: UInt32  # (S * (N + 1),): rank -> first of its rows; one more for each sample
-    samples: range  # of the layers
+    samples: range  # of the image
 
     @staticmethod
     def find(bins: TileBins, stop: UInt32, samples: range) -> CompositedPairs:
-        """Find the pairs before each micro-tile's ``stop``; see :class:`.Layers`."""
+        """Find the pairs before each micro-tile's ``stop``; see :class:`.CompositedTiles`."""
         t, count = types_of(bins.rows.Float), len(samples)
         padded, num_entries = dr.width(bins.masks), bins.num_entries
         _, entry = divide(dr.arange(t.UInt32, count * padded), padded, count)
@@ -81,7 +81,7 @@ class CompositedPairs:
 class Band:
     """Consecutive tiles, their sorted entries, and the number of slots of these."""
 
-    tiles: range  # of all samples of the layers
+    tiles: range  # of all samples of the image
     entries: range  # of all samples of the pairs
     num_slots: int
 
