@@ -98,7 +98,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - probes
        - |string|
        - Ids of shapes and emitters that have a probe, separated by commas. (Default: none)
-     * - unseen
+     * - probe_fallback
        - |string|
        - Rays that pass behind something that is visible from a probe's centre. ``none``: they meet
          no splats; ``rays``: they are traced as with ``light`` ``rays``. (Default: ``none``)
@@ -106,7 +106,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - |int|
        - Number of splats that a traced ray draws: 3 (also for 1 and 2) to 4096; 0: it composites
          all. (Default: 4)
-     * - exposure
+     * - radiance_scale
        - |float|
        - Radiance of a splat of colour 1 in reflections and transmission. (Default: 1)
      * - shadows

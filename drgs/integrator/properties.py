@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +20,8 @@ import numpy as np
 from drgs.config.approximations import (
     DECLARED,
     Approximations,
+    Declared,
+    Limits,
     Value,
     from_ply_header,
     parse_error,
@@ -35,65 +38,48 @@ if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
     from drgs.integrator.gathering import ShRotation
 
 
-class Property(NamedTuple):
-    """A property of a plugin, with values of one type."""
-
-    kind: type  # bool, int, float or str
-    default: Value | None
-    expected: str  # in messages
-    allows: Callable[[Any], bool] = lambda value: True
-    words: Sequence[str] = ()
-
-
-def flag(default: bool) -> Property:
+def flag(default: bool) -> Declared:
     """Declare true or false."""
-    return Property(bool, default, "true or false")
+    return Declared(default)
 
 
-def number(default: float) -> Property:
+def number(default: float) -> Declared:
     """Declare a number that is finite in single precision."""
-    return Property(float, default, "a finite number", lambda v: math.isfinite(_single(v)))
+    return Declared(float(default), limits=Limits("a finite number", gt=-math.inf, lt=math.inf))
 
 
-def positive(default: float) -> Property:
+def positive(default: float) -> Declared:
     """Declare a number that is positive and finite in single precision."""
-    return Property(float, default, "a positive number", lambda v: 0 < _single(v) < math.inf)
+    return Declared(float(default), limits=Limits("a positive number", gt=0, lt=math.inf))
 
 
-def integer(default: int | None, least: int, most: int = MAX_INT) -> Property:
+def integer(default: int | None, least: int, most: int = MAX_INT) -> Declared:
     """Declare an integer from ``least`` to ``most``."""
-    expected = f"an integer from {least} to {most}"
-    return Property(int, default, expected, lambda v: least <= v <= most)
+    return Declared(default, limits=Limits(f"an integer from {least} to {most}", ge=least, le=most))
 
 
-def one_of(*words: str) -> Property:
+def one_of(*words: str) -> Declared:
     """Declare one of several words, the first of which is the default."""
-    return Property(str, words[0], f"one of {', '.join(words)}", words.__contains__, words)
+    return Declared(words[0], choices=words)
 
 
-def _single(value: float) -> float:
-    with np.errstate(over="ignore"):
-        return float(np.float32(value))
+@contextmanager
+def _naming(props: mi.Properties) -> Iterator[None]:
+    """Raise errors of values as those of the plugin."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        kind = PluginTypeError if isinstance(error, TypeError) else PluginError
+        raise kind(f"{props.plugin_name()}: {error}") from None
 
 
-def read(props: mi.Properties, declared: Mapping[str, Property]) -> dict[str, Any]:
+def read(props: mi.Properties, declared: Mapping[str, Declared]) -> dict[str, Any]:
     """Return the values of declared properties, or their defaults."""
-    return {
-        name: _check_property(props, name, one) if name in props else one.default
-        for name, one in declared.items()
-    }
-
-
-def _check_property(props: mi.Properties, name: str, declared: Property) -> Any:
-    value, where = props[name], f"{props.plugin_name()}: {name} must be"
-    if declared.kind is float and type(value) is int:
-        value = float(value)
-    if type(value) is not declared.kind:
-        raise PluginTypeError(f"{where} {declared.expected}, got {value!r}")
-    if not declared.allows(value):
-        hint = did_you_mean(str(value), declared.words)
-        raise PluginError(f"{where} {declared.expected}, got {value!r}{hint}")
-    return value
+    with _naming(props):
+        return {
+            name: one.check(name, props[name]) if name in props else one.default
+            for name, one in declared.items()
+        }
 
 
 def matrix(props: mi.Properties, name: str) -> np.ndarray:
@@ -121,15 +107,13 @@ SETTINGS = {
     "nested_spp": integer(0, least=0),
     "light": one_of("none", "probe", "rays"),
     "light_samples": integer(4, 0, 4096),
-    "unseen": one_of("none", "rays"),
-    "exposure": positive(1.0),
+    "probe_fallback": one_of("none", "rays"),
+    "radiance_scale": positive(1.0),
 }
 """Settings of ``splats`` with single values, besides the approximations."""
 
-APPROXIMATIONS = {
-    name: Property(one.kind, one.default, one.expected_values, one.allows, one.words)
-    for name, one in DECLARED.items()
-}
+FORMER_NAMES = {"unseen": "probe_fallback", "exposure": "radiance_scale"}
+"""Names that properties of ``splats`` had, which are still read."""
 
 FEATURE = "feature_"  # prefix of the names of the user's own features
 SHAPES_TO_WORLD = "shapes_to_world"  # prefix of properties with the ``to_world`` of shapes
@@ -149,7 +133,7 @@ KNOWN = (
         "ignore",
         "error",
     ),
-    *("smoothing", *SETTINGS, *APPROXIMATIONS, *PARAMETER_NAMES),
+    *("smoothing", *SETTINGS, *DECLARED, *PARAMETER_NAMES),
 )
 """Properties of ``splats``, besides nested objects and names with a prefix."""
 
@@ -162,6 +146,9 @@ def read_state(
     nested: Sequence[mi.SamplingIntegrator],
 ) -> SplatsState:
     """Return the state of ``splats``; objects: nested ``splats``; nested: other integrators."""
+    for former, name in FORMER_NAMES.items():
+        if former in props and name not in props:
+            props[name] = props[former]
     if len(nested) > 1:
         raise PluginError(
             f"splats: at most one integrator can be nested besides splats, got {len(nested)}"
@@ -176,7 +163,9 @@ def read_state(
         own.check_to_world()
     every = {"": own} | {f"{name}.": one for name, one in objects.items()}
     header = _merge_headers(props, {one.file: one.header for one in every.values() if one.file})
-    given = {name: one for name, one in APPROXIMATIONS.items() if name in props}
+    with _naming(props):
+        given = {name: props[name] for name in DECLARED if name in props}
+        approximations = Approximations(**{**header, **given})
     settings = read(props, SETTINGS)
     state = SplatsState(
         own=own,
@@ -186,7 +175,7 @@ def read_state(
         nested=next(iter(nested), None),
         default_degree=max(one.gaussians.sh_degree for one in every.values()),
         given_degree=settings.pop("sh_degree"),
-        given_approximations=Approximations(**{**header, **read(props, given)}),
+        given_approximations=approximations,
         header=header,
         aovs=_aovs(props, [*AOVS, *feature_widths(every)]),
         error=parse_budget(props.get("error")),

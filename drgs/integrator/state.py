@@ -135,9 +135,9 @@ class SplatsState:
     light: str
     light_samples: int
     probes: Sequence[str]
-    unseen: str
+    probe_fallback: str
     shadows: Sequence[str]
-    exposure: float
+    radiance_scale: float
     error: float | None  # budget of the approximations' error; None: as they are given
     budget_report: Any = None  # drgs.accuracy.error_budget.BudgetReport, once it was met
     cache: RenderCache = field(default_factory=RenderCache)
@@ -200,14 +200,14 @@ class SplatsState:
         gathered = self.cache.gathered
         parts = [one.gaussians for one in self.objects.values()]
         parts = parts if gathered is None else [gathered.gaussians]
-        lit = {} if self.light == "none" else {"light": self.light, "exposure": self.exposure}
+        lit = {name: getattr(self, name) for name in ("light", "radiance_scale")}
         others = {
             "objects": ", ".join(self.nested_objects),
             "hide_emitters": self.hide_emitters,
             "aovs": ", ".join(f"{name}:{kind}" for name, kind in self.aovs.items()),
             "nested": self.nested and self.nested.class_name(),
             "nested_spp": self.nested_spp,
-            **lit,
+            **(lit if self.light != "none" else {}),
             "ignore": ", ".join(self.ignore),
         }
         return {
