@@ -7,7 +7,8 @@ derivatives. Read ``minimal.py`` first: the same without options, on one page.
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from operator import attrgetter
 
@@ -17,18 +18,22 @@ from typing_extensions import override
 
 from drgs.core.arrays import interleave
 from drgs.core.environment import check_variant
-from drgs.core.errors import PluginError, UnsupportedError
+from drgs.core.errors import UnsupportedError
 from drgs.core.types import Bool
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.image_render import ImageRender
-from drgs.integrator.properties import (
-    check_object,
-    nested_integrators,
-    parse_budget,
-    read_state,
-)
+from drgs.integrator.properties import check_object, nested_integrators, read_state
 from drgs.integrator.state import BackwardResult, surfaces_in
 from drgs.splatting.rendering import ProjectionStage
+
+
+def _setting(name: str, doc: str) -> property:
+    """Return a property of the plugin for one of its state, which checks what is set."""
+
+    def assign(self: SplatsIntegrator, value: object) -> None:
+        setattr(self.state, name, value)
+
+    return property(attrgetter(f"state.{name}"), assign, doc=doc)
 
 
 class SplatsIntegrator(mi.CppADIntegrator):
@@ -195,51 +200,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
         if self.last is not None:
             self.last = replace(self.last, frames=[])
 
-    @property
-    def sh_degree(self) -> int:
-        """Highest spherical harmonics degree that is evaluated, 0 to 3. May be set."""
-        return self.state.sh_degree
-
-    @sh_degree.setter
-    def sh_degree(self, degree: int) -> None:
-        if isinstance(degree, (bool, float)) or degree not in range(4):
-            raise PluginError(f"splats: sh_degree must be an integer from 0 to 3, got {degree!r}")
-        self.state.given_degree = int(degree)
-
-    @property
-    def nested_spp(self) -> int:
-        """Samples per pixel of the nested integrator; 0: as many as of the splats. May be set."""
-        return self.state.nested_spp
-
-    @nested_spp.setter
-    def nested_spp(self, count: int) -> None:
-        self.state.nested_spp = count
-
-    @property
-    def smoothing(self) -> mi.Float | None:
-        """Smoothing filter of the own Gaussians (N,), scene units; None: off. May be set."""
-        return self.state.own.gaussians.smoothing
-
-    @smoothing.setter
-    def smoothing(self, filter_: mi.Float | None) -> None:
-        own = self.state.own
-        own.gaussians = replace(own.gaussians, smoothing=filter_)
-
-    @property
-    def error(self) -> float | None:
-        """Error budget, 0..1; None: none. May be set: the next rendering chooses for it."""
-        return self.state.error
-
-    @error.setter
-    def error(self, budget: float | str | None) -> None:
-        self.state.error, self.state.budget_report = parse_budget(budget), None
-
-    budget_report = property(attrgetter("state.budget_report"), doc="What ``error`` has chosen.")
-    gaussians = property(attrgetter("state.gaussians"), doc="All rendered Gaussians, world space.")
-    pipeline = property(attrgetter("state.pipeline"), doc="Stages that the settings select.")
-    srgb_primitives = property(attrgetter("state.srgb_primitives"), doc="If images are linear.")
-    near = property(attrgetter("state.near"), doc="Near plane, scene units.")
-    ignore = property(attrgetter("state.ignore"), doc="Effects that are not simulated.")
+    sh_degree = _setting("sh_degree", "Highest degree of spherical harmonics, 0 to 3. May be set.")
+    nested_spp = _setting("nested_spp", "Samples per pixel of nested; 0: all's. May be set.")
+    smoothing = _setting("smoothing", "Filter of the own Gaussians (N,); None: off. May be set.")
+    error = _setting("error", "Error budget, 0..1; None: none. May be set: the next image chooses.")
+    budget_report = _setting("budget_report", "What ``error`` has chosen.")
+    gaussians = _setting("gaussians", "All rendered Gaussians, world space.")
+    pipeline = _setting("pipeline", "Stages that the settings select.")
+    near = _setting("near", "Near plane, scene units.")
+    ignore = _setting("ignore", "Effects that are not simulated.")
 
     def use_projection(self, stage: ProjectionStage) -> None:
         """Project the Gaussians by another stage, such as one across several processes."""
@@ -264,11 +233,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        sensor = _resolve_sensor(scene, sensor)
-        with self._lock, dr.suspend_grad():
-            self.state.cache.sensor = sensor
-            self._gather(scene)
-            image = ImageRender.prepare(self.state, scene, sensor, seed, spp).image()
+        with self._rendering(scene, sensor, seed, spp) as render:
+            image = render.image()
             if evaluate:
                 dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -284,11 +250,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         spp: int = 0,
     ) -> None:
         """Accumulate derivatives into parameters; leave a ``BackwardResult`` in ``last``."""
-        sensor = _resolve_sensor(scene, sensor)
-        self._check_derivatives(scene, sensor, dr.ADMode.Backward)
-        with self._lock, dr.suspend_grad():
-            self._gather(scene)
-            render = ImageRender.prepare(self.state, scene, sensor, seed, spp)
+        with self._rendering(scene, sensor, seed, spp, dr.ADMode.Backward) as render:
             gradients = render.backward(params, grad_in)
             means2d, frames = gradients.means2d, self.state.cache.kept["frames 0"].value
             self.last = BackwardResult(
@@ -300,7 +262,6 @@ class SplatsIntegrator(mi.CppADIntegrator):
             if gradients.parameters is not None:
                 with dr.resume_grad():
                     self.state.accumulate(scene, gradients.parameters)
-            sensor.film().clear()  # it may hold an attached block
 
     @override
     def render_forward(
@@ -312,17 +273,38 @@ class SplatsIntegrator(mi.CppADIntegrator):
         spp: int = 0,
     ) -> mi.TensorXf:
         """Return the directional derivative of the image along gradients set on parameters."""
-        sensor = _resolve_sensor(scene, sensor)
-        self._check_derivatives(scene, sensor, dr.ADMode.Forward)
-        with self._lock, dr.suspend_grad():
-            self._gather(scene)
+        with self._rendering(scene, sensor, seed, spp, dr.ADMode.Forward) as render:
             with dr.resume_grad():
                 tangents = self.state.tangents(scene)
-            d_image = ImageRender.prepare(self.state, scene, sensor, seed, spp).tangent(
-                params, tangents
+            return render.tangent(params, tangents)
+
+    @contextmanager
+    def _rendering(
+        self,
+        scene: mi.Scene,
+        sensor: int | mi.Sensor,
+        seed: int | mi.UInt32,
+        spp: int,
+        mode: dr.ADMode = dr.ADMode.Primal,
+    ) -> Iterator[ImageRender]:
+        """Yield an image to be rendered or, with another mode, differentiated."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise UnsupportedError(
+                "splats: rendering cannot be recorded by dr.freeze, as it reads counts back from "
+                "the device: call mi.render outside of the frozen function"
             )
-            sensor.film().clear()  # it holds an attached block
-        return d_image
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        if mode != dr.ADMode.Primal and surfaces_in(scene):
+            from drgs.integrator.derivatives import check_derivatives
+
+            check_derivatives(self.state, scene, sensor, mode)
+        with self._lock, dr.suspend_grad():
+            if mode == dr.ADMode.Primal:
+                self.state.cache.sensor = sensor
+            self._gather(scene)
+            yield ImageRender.prepare(self.state, scene, sensor, seed, spp)
+            if mode != dr.ADMode.Primal:
+                sensor.film().clear()  # it may hold an attached block
 
     @override
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]  called by keyword
@@ -368,32 +350,12 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
             shade(self.state, scene)
         if self.state.error is not None and self.state.budget_report is None:
-            self._meet_error_budget(scene, self.state.error)
+            from drgs.integrator.error_budget import meet_error_budget
 
-    def _meet_error_budget(self, scene: mi.Scene, error: float) -> None:
-        """Choose approximations for the scene's sensors, or for the one that is rendered."""
-        from drgs.integrator.error_budget import meet_error_budget
-
-        alone = self.state.cache.sensor
-        if sensors := scene.sensors() or ([] if alone is None else [alone]):
-            report = meet_error_budget(self.state, sensors, error)
-            mi.Log(mi.LogLevel.Info, report.line())  # pyright: ignore[reportCallIssue]  no type
-
-    def _check_derivatives(self, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode) -> None:
-        if surfaces_in(scene):
-            from drgs.integrator.derivatives import check_derivatives
-
-            check_derivatives(self.state, scene, sensor, mode)
-
-
-def _resolve_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
-    """Return the sensor; UnsupportedError while Dr.Jit records."""
-    if dr.flag(dr.JitFlag.FreezingScope):
-        raise UnsupportedError(
-            "splats: rendering cannot be recorded by dr.freeze, as it reads counts back from the "
-            "device: call mi.render outside of the frozen function"
-        )
-    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            alone = self.state.cache.sensor
+            if sensors := scene.sensors() or ([] if alone is None else [alone]):
+                report = meet_error_budget(self.state, sensors, self.state.error)
+                mi.Log(mi.LogLevel.Info, report.line())  # pyright: ignore[reportCallIssue]  no type
 
 
 mi.register_integrator("splats", lambda props: SplatsIntegrator(props))

@@ -24,7 +24,6 @@ from drgs.config.approximations import (
     Limits,
     Value,
     from_ply_header,
-    parse_error,
 )
 from drgs.core.constants import MAX_INT, NEAR
 from drgs.core.errors import PluginError, PluginTypeError, UserNote, did_you_mean
@@ -32,7 +31,14 @@ from drgs.core.origin import WORLD, format_origin
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.light.rays import TransportIntegrator
-from drgs.integrator.state import AOVS, SplatObject, SplatsState, check_shapes, feature_widths
+from drgs.integrator.state import (
+    AOVS,
+    SplatObject,
+    SplatsState,
+    check_shapes,
+    feature_widths,
+    parse_budget,
+)
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
     from drgs.integrator.gathering import ShRotation
@@ -178,7 +184,7 @@ def read_state(
         given_approximations=approximations,
         header=header,
         aovs=_aovs(props, [*AOVS, *feature_widths(every)]),
-        error=parse_budget(props.get("error")),
+        given_error=parse_budget(props.get("error")),
         ignore=_words(props, "ignore"),
         probes=_words(props, "probes"),
         shadows=_words(props, "shadows"),
@@ -206,16 +212,6 @@ def _check_settings(state: SplatsState) -> None:
             raise PluginError(
                 f"splats: ignore must be a list of {', '.join(IGNORABLE)}, got {word!r}"
             )
-
-
-def parse_budget(value: object) -> float | None:
-    """Return an error budget given as a number, or as text with a unit; None: none."""
-    if value is None:
-        return None
-    try:
-        return parse_error(value)
-    except ValueError as error:
-        raise PluginError(f"splats: error {error}") from None
 
 
 def _words(props: mi.Properties, name: str) -> tuple[str, ...]:

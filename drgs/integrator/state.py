@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
-from drgs.config.approximations import Approximations, Value
+from drgs.config.approximations import Approximations, Value, parse_error
 from drgs.core.arrays import tangent_of
 from drgs.core.constants import MAX_FEATURES
 from drgs.core.errors import PluginError, UnsupportedError
@@ -138,7 +138,7 @@ class SplatsState:
     probe_fallback: str
     shadows: Sequence[str]
     radiance_scale: float
-    error: float | None  # budget of the approximations' error; None: as they are given
+    given_error: float | None  # budget of the approximations' error; None: as they are given
     budget_report: Any = None  # drgs.accuracy.error_budget.BudgetReport, once it was met
     cache: RenderCache = field(default_factory=RenderCache)
     projection: rendering.ProjectionStage = field(default_factory=rendering.Projected)
@@ -162,6 +162,30 @@ class SplatsState:
         if self.cache.gathered is not None:
             return self.cache.gathered.gaussians.sh_degree
         return self.default_degree
+
+    @sh_degree.setter
+    def sh_degree(self, degree: int) -> None:
+        if isinstance(degree, (bool, float)) or degree not in range(4):
+            raise PluginError(f"splats: sh_degree must be an integer from 0 to 3, got {degree!r}")
+        self.given_degree = int(degree)
+
+    @property
+    def smoothing(self) -> Float | None:
+        """Smoothing filter of the own Gaussians (N,), scene units; None: off."""
+        return self.own.gaussians.smoothing
+
+    @smoothing.setter
+    def smoothing(self, filter_: Float | None) -> None:
+        self.own.gaussians = replace(self.own.gaussians, smoothing=filter_)
+
+    @property
+    def error(self) -> float | None:
+        """Error budget, 0..1; None: none."""
+        return self.given_error
+
+    @error.setter
+    def error(self, budget: float | str | None) -> None:
+        self.given_error, self.budget_report = parse_budget(budget), None
 
     @property
     def pipeline(self) -> rendering.Pipeline:
@@ -342,6 +366,16 @@ class SplatsState:
             **{name: tangent_of(getattr(own, name)) for name in PARAMETER_NAMES},
             features=own.features and {k: tangent_of(v) for k, v in own.features.items()},
         )
+
+
+def parse_budget(value: object) -> float | None:
+    """Return an error budget given as a number, or as text with a unit; None: none."""
+    if value is None:
+        return None
+    try:
+        return parse_error(value)
+    except ValueError as error:
+        raise PluginError(f"splats: error {error}") from None
 
 
 def check_shapes(gaussians: Gaussians) -> None:
