@@ -17,7 +17,7 @@ from drgs.splatting.grid import TileGrid
 from drgs.splatting.projection import load_rows
 from drgs.splatting.rasterize import CompositedTiles, Records, composite, composite_adjoint
 from drgs.splatting.rendering import Pipeline, gradients_of
-from drgs.splatting.tiles import bin_footprints, footprints_of
+from drgs.splatting.tiles import bin_splats, splat_table
 
 
 class MinimalSplatsIntegrator(mi.CppADIntegrator):
@@ -94,7 +94,7 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         rows = load_rows(self._gaussians, self.pipeline.sh_degree)
         splats = self.pipeline.project(rows, camera)
         grid = TileGrid(camera.width, camera.height)
-        bins = bin_footprints(footprints_of(splats, grid, list(splats.colors)), grid, DEFAULT)
+        bins = bin_splats(splat_table(splats, grid, list(splats.colors)), grid, DEFAULT)
         tiles = composite(bins, Records.from_ranks(bins, bins.rows.load))
         return sensor.film(), camera, tiles
 

@@ -65,20 +65,20 @@ class Copies:
         self.chain = Instrumented(
             board,
             rendering,
-            derivatives=["frames_adjoint", "frames_tangent", "Projected.gradients"],
-            forward=["render", "Frame.planes", "Projected.footprints"],
+            derivatives=["frames_adjoint", "frames_tangent", "DirectProjection.gradients"],
+            forward=["render", "Frame.planes", "DirectProjection.project"],
         )
         self.model = Instrumented(
             board,
             footprint,
             derivatives=[
-                "FootprintModel.footprint",
-                "FootprintModel.alphas",
+                "ImageModel.footprint",
+                "ImageModel.alphas",
                 *(f"GaussianFalloff.{name}" for name in FALLOFF_DERIVATIVES),
                 *(f"PixelCenters.{name}" for name in ("sum", "sum_dx", "sum_dy", "sum_dy_dy")),
                 *(f"SplatFeatures.{name}" for name in ("add_derivatives", "tangents")),
             ],
-            forward=["FootprintModel.footprint", "FootprintModel.alphas"],
+            forward=["ImageModel.footprint", "ImageModel.alphas"],
         )
         self.falloff = Instrumented(
             board,
@@ -130,7 +130,7 @@ class Copies:
                 for name, value in vars(tiles.bins.model).items()
                 if type(value).__module__ != footprint.__name__
             }
-            bins = replace(tiles.bins, model=self.model["FootprintModel"](**given))
+            bins = replace(tiles.bins, model=self.model["ImageModel"](**given))
             return self.kernels[name](replace(tiles, bins=bins), *arguments)
 
         return run
@@ -144,7 +144,9 @@ class Copies:
         for name in STAGES:
             patch.setattr(order, name, self.stage(name))
         # Frames of the forward pass, which is not the copy's, go back through this.
-        patch.setattr(rendering.Projected, "gradients", self.chain["Projected"].gradients)
+        patch.setattr(
+            rendering.DirectProjection, "gradients", self.chain["DirectProjection"].gradients
+        )
         patch.setattr(footprint, "GaussianFalloff", self.model["GaussianFalloff"])
         patch.setattr(special_checks, "Alpha", self.model["Alpha"])
         patch.setattr(special_checks, "composite_step", self.kernels["composite_step"])

@@ -462,13 +462,16 @@ class Conversion:
         return dr.select(inside, dr.replace_grad(clamped, value), clamped)
 
 
-def conversions_of(shapes: Sequence[mi.Shape], turns: Mapping[str, ShRotation]) -> list[Conversion]:
-    """Read shapes, attached; turns: by their ids, "": of all other shapes."""
-    unknown = set(turns) - {shape.id() for shape in shapes} - {""}
+def conversions_of(
+    shapes: Sequence[mi.Shape], rotations: Mapping[str, ShRotation]
+) -> list[Conversion]:
+    """Read shapes, attached; rotations: by their ids, "": of all other shapes."""
+    unknown = set(rotations) - {shape.id() for shape in shapes} - {""}
     if unknown:
         found = ", ".join(f"'{shape.id()}'" for shape in shapes if shape.id()) or "none"
         raise PluginError(
             f"splats: shapes_to_world_{min(unknown)} must end with the id of a shape of type "
             f"ellipsoids or ellipsoidsmesh, ids are: {found}"
         )
-    return [Conversion(read(shape), turns.get(shape.id(), turns.get(""))) for shape in shapes]
+    others = rotations.get("")
+    return [Conversion(read(shape), rotations.get(shape.id(), others)) for shape in shapes]

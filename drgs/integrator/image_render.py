@@ -261,9 +261,9 @@ class SensorRender:
             dr.eval(d_passes[first : first + PASSES_PER_KERNEL], d_constant)
         with dr.resume_grad():
             state = self._state()
-            of_camera = state.is_attached
+            is_attached = state.is_attached
         by_time = [
-            rendering.frames_adjoint(self.splats.gaussians, *of_time, of_camera)
+            rendering.frames_adjoint(self.splats.gaussians, *of_time, is_attached)
             for of_time in zip(self._frames(), d_planes, strict=True)
         ]
         with dr.resume_grad():

@@ -176,7 +176,7 @@ def read_state(
     state = SplatsState(
         own=own,
         nested_objects=dict(objects),
-        turns=_turns_of_shapes(props),
+        sh_rotations=_sh_rotations(props),
         background=_background(props),
         nested=next(iter(nested), None),
         default_degree=max(one.gaussians.sh_degree for one in every.values()),
@@ -280,7 +280,7 @@ def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
     return mi.TensorXf(value)
 
 
-def _turns_of_shapes(props: mi.Properties) -> dict[str, ShRotation]:
+def _sh_rotations(props: mi.Properties) -> dict[str, ShRotation]:
     """Return rotations of spherical harmonics by ids of shapes; "": all other shapes."""
     names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
     if not names:
@@ -288,13 +288,13 @@ def _turns_of_shapes(props: mi.Properties) -> dict[str, ShRotation]:
     from drgs.gaussians.similarity import Similarity
     from drgs.integrator.gathering import ShRotation
 
-    turns = {}
+    sh_rotations = {}
     for name in names:
         shape = name.removeprefix(SHAPES_TO_WORLD).removeprefix("_")
-        turns[shape] = ShRotation.from_rotation(
+        sh_rotations[shape] = ShRotation.from_rotation(
             Similarity.from_matrix(matrix(props, name), f"splats: {name}").rotation
         )
-    return turns
+    return sh_rotations
 
 
 def _background(props: mi.Properties) -> mi.Color3f | mi.Texture:

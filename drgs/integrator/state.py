@@ -119,7 +119,7 @@ class SplatsState:
 
     own: SplatObject
     nested_objects: dict[str, SplatObject]  # by name
-    turns: dict[str, ShRotation]  # of harmonics, by shapes' ids; "": of all other shapes
+    sh_rotations: dict[str, ShRotation]  # of harmonics, by shapes' ids; "": of all other shapes
     background: mi.Color3f | mi.Texture  # in display space; or linear
     nested: mi.SamplingIntegrator | None  # of surfaces
     default_degree: int  # of spherical harmonics, where the scene has no other Gaussians
@@ -141,7 +141,7 @@ class SplatsState:
     given_error: float | None  # budget of the approximations' error; None: as they are given
     budget_report: Any = None  # drgs.accuracy.error_budget.BudgetReport, once it was met
     cache: RenderCache = field(default_factory=RenderCache)
-    projection: rendering.ProjectionStage = field(default_factory=rendering.Projected)
+    projection: rendering.ProjectionStage = field(default_factory=rendering.DirectProjection)
 
     @property
     def objects(self) -> dict[str, SplatObject]:
@@ -308,7 +308,9 @@ class SplatsState:
         cache.has_ellipsoids = bool(shapes)
         with dr.resume_grad():
             is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
-            is_alone = not (shapes or set(self.turns) - {""} or self.nested_objects or is_moved)
+            is_alone = not (
+                shapes or set(self.sh_rotations) - {""} or self.nested_objects or is_moved
+            )
             parts = [] if is_alone else self.parts(shapes)
         if is_alone:
             cache.gathered = None
@@ -328,10 +330,10 @@ class SplatsState:
     def parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
         """Return the Gaussians of objects and shapes, attached, in the order of rendering."""
         parts: list[Part] = [*self._placements()]
-        if shapes or self.turns:
+        if shapes or self.sh_rotations:
             from drgs.integrator.gathering import conversions_of
 
-            parts += conversions_of(shapes, self.turns)
+            parts += conversions_of(shapes, self.sh_rotations)
         return parts
 
     def _placements(self) -> list[Placement]:

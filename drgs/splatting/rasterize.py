@@ -170,7 +170,7 @@ class Records:
 def composite(bins: TileBins, records: Records) -> CompositedTiles:
     """Composite the features of all splats.
 
-    bins: from ``bin_footprints``; records: ``Records.from_ranks(bins, bins.rows.load)``.
+    bins: from ``bin_splats``; records: ``Records.from_ranks(bins, bins.rows.load)``.
     """
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)

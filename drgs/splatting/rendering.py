@@ -5,8 +5,8 @@ approximations, as functions and objects. Dr.Jit traces only the functions of th
 effect that is not part of it adds no instruction to any kernel. ``drgs.accuracy.pipeline`` makes a
 pipeline from names.
 
-The chain is  Gaussians -> ``project`` -> Splats2D -> ``footprints_of`` -> Footprints
--> ``bin_footprints`` -> TileBins -> ``composite`` -> CompositedTiles.  The adjoint runs backwards:
+The chain is  Gaussians -> ``project`` -> Splats2D -> ``splat_table`` -> SplatTable
+-> ``bin_splats`` -> TileBins -> ``composite`` -> CompositedTiles.  The adjoint runs backwards:
 the hand-written adjoint of compositing gives the derivatives of the 2D splats, and Dr.Jit
 differentiates projection and SH, which are traced again, one Gaussian per lane, so no gradient is
 scattered.
@@ -27,13 +27,13 @@ from drgs.core.arrays import first_numbers, repeat_array, store_columns, types_o
 from drgs.core.constants import LOW_PASS
 from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.splatting.footprint import DEFAULT, FootprintModel
+from drgs.splatting.footprint import DEFAULT, ImageModel
 from drgs.splatting.grid import TileGrid
 from drgs.splatting.order import CenterOrder, group_features
 from drgs.splatting.projection import (
+    FilmProjection,
     GaussianRows,
     OpacityRule,
-    Projection,
     SplatColor,
     Splats2D,
     color_at_mean,
@@ -43,7 +43,7 @@ from drgs.splatting.projection import (
     project,
 )
 from drgs.splatting.rasterize import CompositedTiles, SplatGradients
-from drgs.splatting.tiles import Footprints, TileBins, bin_footprints, footprints_of
+from drgs.splatting.tiles import SplatTable, TileBins, bin_splats, splat_table
 
 Feature = Callable[[Splats2D, GaussianRows, Camera], list[Float]]
 """Composited values of each splat: columns, Float (N,) each, one for each plane."""
@@ -64,30 +64,38 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
 class ProjectionStage(Protocol):
     """The source of a frame's splats, and the destination of their derivatives."""
 
-    def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
+    def project(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
         """Return the splats of the Gaussians for ``camera``."""
         ...
 
     def gradients(
-        self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
+        self,
+        gaussians: Gaussians,
+        frame: Frame,
+        of_splats: SplatGradients,
+        with_camera: bool,
     ) -> GaussianGradients:
         """Return derivatives of the loss, from those with respect to the splats of a frame."""
         ...
 
 
 @dataclass(frozen=True)
-class Projected(ProjectionStage):
+class DirectProjection(ProjectionStage):
     """Project the rendered Gaussians, and differentiate the projection."""
 
     @override
-    def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
-        return project_footprints(gaussians, camera, pipeline)
+    def project(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
+        return project_splats(gaussians, camera, pipeline)
 
     @override
     def gradients(
-        self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
+        self,
+        gaussians: Gaussians,
+        frame: Frame,
+        of_splats: SplatGradients,
+        with_camera: bool,
     ) -> GaussianGradients:
-        found = gradients_of(gaussians, frame.camera, frame.pipeline, of_splats, of_camera)
+        found = gradients_of(gaussians, frame.camera, frame.pipeline, of_splats, with_camera)
         return replace(found, visible=on_film(frame.tiles.bins))
 
 
@@ -104,12 +112,12 @@ class Pipeline:
     opacity_rule: OpacityRule = plain_opacity
     features: tuple[Feature, ...] = (color_features,)
     rows: Callable[[GaussianRows], GaussianRows] = load_unchanged  # applied before projection
-    shape: Projection = ewa  # projection of mean and covariance
+    shape: FilmProjection = ewa  # projection of mean and covariance
     color: SplatColor = color_at_mean  # stored numbers of a splat's colour
     low_pass: float = LOW_PASS  # px^2
-    model: FootprintModel = DEFAULT
+    model: ImageModel = DEFAULT
     order: CenterOrder = field(default_factory=CenterOrder)
-    source: ProjectionStage = Projected()
+    source: ProjectionStage = DirectProjection()
     of_smoothing: bool = False  # whether the smoothing filter is differentiated
 
     def select_differentiable(self, rows: GaussianRows) -> GaussianRows:
@@ -176,12 +184,12 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     """
     model = pipeline.model.for_camera(camera)
     grid = TileGrid(camera.width, camera.height, model.positions.samples)
-    bins = bin_footprints(pipeline.source.footprints(gaussians, camera, pipeline), grid, model)
+    bins = bin_splats(pipeline.source.project(gaussians, camera, pipeline), grid, model)
     order = group_features(pipeline.order.for_camera(camera), bins)
     return Frame(pipeline, camera, order, order.composite(bins, order.records(bins)))
 
 
-def project_footprints(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
+def project_splats(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
     """Project ``gaussians`` and store the inputs of compositing; see :func:`render`."""
     rows = load_rows(gaussians, pipeline.sh_degree)
     splats = pipeline.project(rows, camera)
@@ -189,10 +197,10 @@ def project_footprints(gaussians: Gaussians, camera: Camera, pipeline: Pipeline)
     grid, model = TileGrid(camera.width, camera.height), pipeline.model.for_camera(camera)
     order = pipeline.order.for_camera(camera)
     keys, splats = order.keys(splats), replace(splats, depths=order.sort_depths(splats))
-    return footprints_of(splats, grid, columns, model, keys)
+    return splat_table(splats, grid, columns, model, keys)
 
 
-def render_again(frame: Frame, model: FootprintModel) -> Frame:
+def render_again(frame: Frame, model: ImageModel) -> Frame:
     """Composite the same splats, in the same tiles, with another footprint model.
 
     model: that of the frame's pipeline, except for sample positions within the same margin, or
@@ -208,15 +216,15 @@ def frames_adjoint(
     gaussians: Gaussians,
     frames: list[Frame],
     d_planes: list[list[Float]],
-    of_camera: bool = False,
+    with_camera: bool = False,
 ) -> GaussianGradients:
     """Return derivatives of a loss with respect to all parameters.
 
     The loss depends on several frames of the same splats and one camera.
 
     gaussians: the input of ``frames``; d_planes: for each frame, derivatives of the loss with
-    respect to its planes (see :meth:`Frame.planes`); of_camera: also differentiate with respect to
-    the camera. Samples are added in their order.
+    respect to its planes (see :meth:`Frame.planes`); with_camera: also differentiate with respect
+    to the camera. Samples are added in their order.
 
     Raises NotImplementedError if the pipeline has no derivatives with respect to the camera.
 
@@ -230,7 +238,7 @@ def frames_adjoint(
             samples = range(first, min(first + at_once, bins.grid.samples))
             total = frame.order.adjoint(frame.tiles, of_frame, samples, total)
     assert total is not None, "there is at least one frame"
-    return frames[0].pipeline.source.gradients(gaussians, frames[0], total, of_camera)
+    return frames[0].pipeline.source.gradients(gaussians, frames[0], total, with_camera)
 
 
 ENTRIES_AT_ONCE = 1 << 19
@@ -243,15 +251,15 @@ def gradients_of(
     camera: Camera,
     pipeline: Pipeline,
     of_splats: SplatGradients,
-    of_camera: bool = False,
+    with_camera: bool = False,
 ) -> GaussianGradients:
     """Return derivatives of the parameters, given those of the 2D splats, by Dr.Jit.
 
     See :func:`frames_adjoint`; ``visible`` does not include the bounds of the film.
     """
-    found, of_rows = gradients_by_row(gaussians, camera, pipeline, of_splats, of_camera)
+    found, of_rows = gradients_by_row(gaussians, camera, pipeline, of_splats, with_camera)
     # dr.sum adds in the same order in every run.
-    return replace(found, camera=[dr.sum(each) for each in of_rows]) if of_camera else found
+    return replace(found, camera=[dr.sum(each) for each in of_rows]) if with_camera else found
 
 
 def gradients_by_row(
@@ -259,14 +267,15 @@ def gradients_by_row(
     camera: Camera,
     pipeline: Pipeline,
     of_splats: SplatGradients,
-    of_camera: bool,
+    with_camera: bool,
 ) -> tuple[GaussianGradients, list[Float]]:
     """Return :func:`gradients_of`, and each Gaussian's contribution to the camera's derivatives.
 
-    Contributions are evaluated: (N,) for each of ``camera.numbers()``, none without ``of_camera``.
+    Contributions are evaluated: (N,) for each of ``camera.numbers()``; none without
+    ``with_camera``.
     """
     rows = load_rows(gaussians, pipeline.sh_degree)
-    d_rows, visible, d_numbers = _back_to_rows(rows, camera, pipeline, of_splats, of_camera)
+    d_rows, visible, d_numbers = _back_to_rows(rows, camera, pipeline, of_splats, with_camera)
     columns = _columns_of(d_rows, gaussians, visible)
     faults = _nonfinite_flags(d_rows, visible)
     parameters = _as_tensors(columns, gaussians, [faults])
@@ -323,11 +332,11 @@ def _back_to_rows(
     camera: Camera,
     pipeline: Pipeline,
     of_splats: SplatGradients,
-    of_camera: bool = False,
+    with_camera: bool = False,
 ) -> tuple[GaussianRows, Bool, list[Float]]:
     """Return derivatives per lane, the visible lanes, and derivatives of the camera's numbers."""
     falloff, numbers = pipeline.model.for_camera(camera).falloff, []
-    if of_camera:
+    if with_camera:
         pipeline.model.check_differentiable_in_camera()
         camera = camera.by_lane(dr.width(rows.logit_opacities))
         numbers = camera.numbers()
