@@ -174,9 +174,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
     @override
     def traverse(self, cb: mi.TraversalCallback) -> None:
         state, own = self.state, self.state.own
-        found = {name: getattr(own.gaussians, name) for name in PARAMETER_NAMES}
-        found = {name: value for name, value in found.items() if dr.width(value) > 0}
-        found |= own.gaussians.features or {}
+        found = {
+            name: value
+            for name, value in own.gaussians.arrays.items()
+            if name != "smoothing" and (name not in PARAMETER_NAMES or dr.width(value) > 0)
+        }
         if own.has_gaussians:
             found["to_world"] = own.to_world
         found |= self.objects

@@ -50,7 +50,7 @@ from drgs.core.arrays import from_host, interleave, tangent_of, types_of
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.core.types import Float, Matrix4f
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.rotation import (
     left_multiplication_matrix,
     sh_rotation_generators,
@@ -111,8 +111,8 @@ class GatheredGaussians:
             if attached and num > 0:
                 copy = own.detach()
                 dr.enable_grad([copy.values[name] for name in attached])
-                rows = _arrays(_rows(gradients, start, num, degree))
-                found = _arrays(copy.gaussians())
+                rows = _rows(gradients, start, num, degree).arrays
+                found = copy.gaussians().arrays
                 outputs = {k: v for k, v in found.items() if k in rows and dr.grad_enabled(v)}
                 for name, values in outputs.items():
                     dr.accum_grad(values, rows[name])
@@ -132,7 +132,7 @@ class GatheredGaussians:
                 dr.set_grad(copy.values[name], tangent_of(values))
             moved = copy.gaussians()
             dr.forward_to(moved)
-            found.append(_gaussians({k: tangent_of(v) for k, v in _arrays(moved).items()}))
+            found.append(Gaussians.from_arrays({k: tangent_of(v) for k, v in moved.arrays.items()}))
         return _concatenate(found, self.gaussians.sh_degree)
 
 
@@ -153,7 +153,7 @@ def gather(parts: Sequence[Part], last: GatheredGaussians | None) -> GatheredGau
 
 
 def _concatenate(parts: Sequence[Gaussians], degree: int) -> Gaussians:
-    found = [(part.num_gaussians, _arrays(part)) for part in parts if part.num_gaussians > 0]
+    found = [(part.num_gaussians, part.arrays) for part in parts if part.num_gaussians > 0]
     shapes = {k: v.shape[1:] for _, arrays in found for k, v in arrays.items()}
     shapes["shN"] = _sh_shape(degree)
     whole = {}
@@ -162,16 +162,16 @@ def _concatenate(parts: Sequence[Gaussians], degree: int) -> Gaussians:
         filled = [block for block in blocks if dr.width(block) > 0]  # dr.concat takes no others
         flat = dr.concat(filled) if len(filled) > 1 else (filled or blocks)[0]
         whole[name] = _reshape(flat, sum(num for num, _ in found), row)
-    return _gaussians(whole)
+    return Gaussians.from_arrays(whole)
 
 
 def _rows(gaussians: Gaussians, start: int, num: int, degree: int) -> Gaussians:
     """Return ``num`` rows from row ``start`` on, with the coefficients of ``degree``."""
-    arrays = _arrays(gaussians)
+    arrays = gaussians.arrays
     shapes = {k: v.shape[1:] for k, v in arrays.items()} | {"shN": _sh_shape(degree)}
     total = gaussians.num_gaussians
     blocks = {k: _block(v, start, num, total, shapes[k]) for k, v in arrays.items()}
-    return _gaussians({k: _reshape(v, num, shapes[k]) for k, v in blocks.items()})
+    return Gaussians.from_arrays({k: _reshape(v, num, shapes[k]) for k, v in blocks.items()})
 
 
 def _sh_shape(degree: int) -> tuple[int, int]:
@@ -180,17 +180,6 @@ def _sh_shape(degree: int) -> tuple[int, int]:
 
 def _reshape(flat: Float, num: int, row: tuple[int, ...]) -> mi.TensorXf | Float:
     return mi.TensorXf(flat, (num, *row)) if row else flat
-
-
-def _arrays(part: Gaussians) -> ParameterArrays:
-    named = {name: getattr(part, name) for name in (*PARAMETER_NAMES, "smoothing")}
-    return {k: v for k, v in {**named, **(part.features or {})}.items() if v is not None}
-
-
-def _gaussians(arrays: ParameterArrays) -> Gaussians:
-    features = {k: v for k, v in arrays.items() if k not in (*PARAMETER_NAMES, "smoothing")}
-    own = {k: v for k, v in arrays.items() if k not in features}
-    return Gaussians(**own, features=features or None)
 
 
 def _block(
@@ -287,14 +276,14 @@ class Placement:
     @staticmethod
     def from_matrix(gaussians: Gaussians, to_world: Matrix4f, name: str) -> Placement:
         """Place Gaussians by one matrix; name: of the parameter."""
-        return Placement({**_arrays(gaussians), TO_WORLD: to_world}, name)
+        return Placement({**gaussians.arrays, TO_WORLD: to_world}, name)
 
     def gaussians(self) -> Gaussians:
         """Return all parameters; PluginError where they leave float32."""
         arrays = {name: values for name, values in self.values.items() if name != TO_WORLD}
         if dr.grad_enabled(self.values[TO_WORLD]) or not self._place.is_identity:
             arrays |= self._transform_arrays(arrays)
-        return _gaussians(arrays)
+        return Gaussians.from_arrays(arrays)
 
     @cached_property
     def _place(self) -> Similarity:

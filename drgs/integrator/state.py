@@ -351,11 +351,9 @@ class SplatsState:
         if self.cache.gathered is not None:
             self.cache.gathered.accumulate(self.parts(ellipsoids_in(scene)), gradients)
             return
-        own = self.own.gaussians
-        features = own.features or {}
-        pairs = [(getattr(own, name), getattr(gradients, name)) for name in PARAMETER_NAMES]
-        pairs += [(features[name], d) for name, d in (gradients.features or {}).items()]
-        for parameter, gradient in pairs:
+        parameters = self.own.gaussians.arrays
+        for name, gradient in gradients.arrays.items():
+            parameter = parameters[name]
             if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
                 dr.accum_grad(parameter, gradient)
 
@@ -364,10 +362,7 @@ class SplatsState:
         if self.cache.gathered is not None:
             return self.cache.gathered.tangents(self.parts(ellipsoids_in(scene)))
         own = self.rendered_part_of(self.own)
-        return Gaussians(
-            **{name: tangent_of(getattr(own, name)) for name in PARAMETER_NAMES},
-            features=own.features and {k: tangent_of(v) for k, v in own.features.items()},
-        )
+        return Gaussians.from_arrays({name: tangent_of(v) for name, v in own.arrays.items()})
 
 
 def parse_budget(value: object) -> float | None:

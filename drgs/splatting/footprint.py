@@ -34,7 +34,7 @@ from drgs.core.constants import (
 )
 from drgs.core.types import Array2f, Bool, Float
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
-from drgs.splatting.projection import Splats2D
+from drgs.splatting.projection import Splats2D, dot
 
 # ----------------------------------------------------------------------------------------------
 # Alpha
@@ -118,7 +118,10 @@ class Alpha:
 
 
 class SamplePositions:
-    """Points of the pixels at which splats are evaluated. Grids of 16 values: 4 rows of 4."""
+    """Points of the pixels at which splats are evaluated. Grids of 16 values: 4 rows of 4.
+
+    Sums are those of points anywhere in their pixels.
+    """
 
     margin: ClassVar[float] = 0.0  # px: distance from a pixel's centre to its point, at most
     samples: int = 1  # times that each pixel is evaluated
@@ -138,19 +141,19 @@ class SamplePositions:
 
     def sum(self, values: list[Float]) -> Float:
         """Sum 16 values."""
-        raise NotImplementedError
+        return total(values)
 
     def sum_dx(self, values: list[Float], dx: list) -> Float:
         """Sum values times dx, a grid of :meth:`offsets`."""
-        raise NotImplementedError
+        return total(_products(values, dx))
 
     def sum_dy(self, values: list[Float], dy: list) -> Float:
         """Sum values times dy."""
-        raise NotImplementedError
+        return total(_products(values, dy))
 
     def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
         """Sum values times dy^2."""
-        raise NotImplementedError
+        return total(_products(_products(values, dy), dy))
 
 
 @dataclass(frozen=True)
@@ -178,16 +181,16 @@ class PixelCenters(SamplePositions):
     def sum_dx(self, values: list[Float], dx: list) -> Float:
         """Sum values times dx: a column shares dx, so columns are summed first."""
         columns = [total([values[MICRO * j + i] for j in range(MICRO)]) for i in range(MICRO)]
-        return _dot(columns, dx[0])
+        return dot(columns, dx[0])
 
     @override
     def sum_dy(self, values: list[Float], dy: list) -> Float:
-        return _dot(self._rows(values), _first_of_rows(dy))
+        return dot(self._rows(values), _first_of_rows(dy))
 
     @override
     def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
         dy = _first_of_rows(dy)
-        return _dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
+        return dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
 
     @staticmethod
     def _rows(values: list[Float]) -> list[Float]:
@@ -210,11 +213,8 @@ def flat_columns(rows: list) -> list[Float]:
     return [value for row in rows for value in row]
 
 
-def _dot(a: list[Float], b: list[Float]) -> Float:
-    result = a[0] * b[0]
-    for x, y in zip(a[1:], b[1:], strict=True):
-        result = dr.fma(x, y, result)
-    return result
+def _products(values: list[Float], grid: list[list[Float]]) -> list[Float]:
+    return [a * b for a, b in zip(values, flat_columns(grid), strict=True)]
 
 
 # ----------------------------------------------------------------------------------------------

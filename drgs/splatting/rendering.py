@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import Any, Protocol
+from typing import Protocol
 
 import drjit as dr
 from typing_extensions import override
@@ -335,23 +335,35 @@ def _back_to_rows(
     with_camera: bool = False,
 ) -> tuple[GaussianRows, Bool, list[Float]]:
     """Return derivatives per lane, the visible lanes, and derivatives of the camera's numbers."""
-    falloff, numbers = pipeline.model.for_camera(camera).falloff, []
-    if with_camera:
-        pipeline.model.check_differentiable_in_camera()
-        camera = camera.by_lane(dr.width(rows.logit_opacities))
-        numbers = camera.numbers()
     with dr.resume_grad():
-        dr.enable_grad(pipeline.select_differentiable(rows), numbers)
-        splats = pipeline.project(rows, camera)
-        outputs = falloff.differentiable(splats)
-        outputs += pipeline.feature_columns(splats, rows, camera)
+        inputs, splats, outputs = _attach(rows, camera, pipeline, with_camera)
         cotangents = of_splats.geometry + of_splats.features
         for output, cotangent in zip(outputs, cotangents, strict=True):
             dr.accum_grad(output, cotangent)
         dr.enqueue(dr.ADMode.Backward, outputs)
         dr.traverse(dr.ADMode.Backward)
         d_rows = pipeline.select_differentiable(dr.grad(rows))
-        return d_rows, dr.detach(splats.visible), [dr.grad(number) for number in numbers]
+        return d_rows, dr.detach(splats.visible), [dr.grad(number) for number in inputs[1]]
+
+
+def _attach(
+    rows: GaussianRows, camera: Camera, pipeline: Pipeline, with_camera: bool
+) -> tuple[tuple[GaussianRows, list[Float]], Splats2D, list[Float]]:
+    """Trace the projection again with derivatives.
+
+    Returns its inputs (rows, numbers of the camera), the splats, and the outputs of which
+    :class:`SplatGradients` has the derivatives.
+    """
+    numbers, falloff = [], pipeline.model.for_camera(camera).falloff
+    if with_camera:
+        pipeline.model.check_differentiable_in_camera()
+        camera = camera.by_lane(dr.width(rows.logit_opacities))
+        numbers = camera.numbers()
+    inputs = pipeline.select_differentiable(rows), numbers
+    dr.enable_grad(inputs)
+    splats = pipeline.project(rows, camera)
+    outputs = falloff.differentiable(splats)
+    return inputs, splats, outputs + pipeline.feature_columns(splats, rows, camera)
 
 
 def weighted_sums(frame: Frame, *planes: Float) -> list[Float]:
@@ -388,12 +400,8 @@ def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGrad
 
 
 def _sum_of(a: Gaussians, b: Gaussians) -> Gaussians:
-    total = {name: getattr(a, name) + getattr(b, name) for name in PARAMETER_NAMES}
-    if a.smoothing is not None:
-        total["smoothing"] = a.smoothing + b.smoothing
-    if a.features and b.features:
-        total["features"] = {name: v + b.features[name] for name, v in a.features.items()}
-    return Gaussians(**total)
+    others = b.arrays
+    return Gaussians.from_arrays({name: v + others[name] for name, v in a.arrays.items()})
 
 
 def decode_nonfinite(fault: int) -> tuple[int, str] | None:
@@ -437,29 +445,17 @@ def _splat_tangents(
     camera_tangents: list[Float] | None = None,
 ) -> SplatGradients:
     """Return tangents of the 2D splats, given those of the parameters, by Dr.Jit."""
-    rows = load_rows(gaussians, frame.pipeline.sh_degree)
-    camera, numbers = frame.camera, []
-    if camera_tangents is not None:
-        frame.pipeline.model.check_differentiable_in_camera()
-        camera = camera.by_lane(dr.width(rows.logit_opacities))
-        numbers = camera.numbers()
+    pipeline, with_camera = frame.pipeline, camera_tangents is not None
+    rows, d_rows = (load_rows(each, pipeline.sh_degree) for each in (gaussians, tangents))
     with dr.resume_grad():
-        differentiated = frame.pipeline.select_differentiable(rows)
-        dr.enable_grad(differentiated, numbers)
-        splats = frame.pipeline.project(rows, camera)
-        d_rows = load_rows(tangents, frame.pipeline.sh_degree)
-        dr.set_grad(differentiated, frame.pipeline.select_differentiable(d_rows))
-        for number, tangent in zip(numbers, camera_tangents or [], strict=True):
-            dr.set_grad(number, tangent)
-        falloff = frame.tiles.bins.model.falloff
-        outputs = falloff.differentiable(splats)
-        outputs += frame.pipeline.feature_columns(splats, rows, camera)
+        inputs, _, outputs = _attach(rows, frame.camera, pipeline, with_camera)
+        dr.set_grad(inputs, (pipeline.select_differentiable(d_rows), camera_tangents or []))
         # Some outputs (depths, p of the conic factor) are inputs of others: the default would clear
         # the derivatives of such interior variables on the way.
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
         columns = [dr.grad(output) for output in outputs]
     dr.eval(columns)
-    count = falloff.num_geometry
+    count = frame.tiles.bins.model.falloff.num_geometry
     return SplatGradients(geometry=columns[:count], features=columns[count:])
 
 
@@ -510,19 +506,8 @@ def _as_tensors(
         flat = first_numbers(stored[name], dr.width(like))
         return t.TensorXf(flat, like.shape) if dr.is_tensor_v(like) else flat
 
-    smoothing, features = gaussians.smoothing, gaussians.features
-    parameters: dict[str, Any] = {
-        name: gradient(name, getattr(gaussians, name)) for name in PARAMETER_NAMES
-    }
-    return Gaussians(
-        **parameters,
-        smoothing=(
-            gradient("smoothing", smoothing)
-            if smoothing is not None and "smoothing" in stored
-            else None
-        ),
-        features=features and {name: gradient(name, like) for name, like in features.items()},
-    )
+    likes = {n: v for n, v in gaussians.arrays.items() if n in stored or n != "smoothing"}
+    return Gaussians.from_arrays({name: gradient(name, like) for name, like in likes.items()})
 
 
 def _nonfinite_flags(d_rows: GaussianRows, visible: Bool) -> UInt32:
