@@ -28,7 +28,7 @@ from drgs.splatting.rendering import ProjectionStage
 
 
 def _setting(name: str, doc: str) -> property:
-    """Return a property of the plugin for one of its state, which checks what is set."""
+    """Return a property that may be set, for one of the state, which checks it."""
 
     def assign(self: SplatsIntegrator, value: object) -> None:
         setattr(self.state, name, value)
@@ -202,15 +202,16 @@ class SplatsIntegrator(mi.CppADIntegrator):
         if self.last is not None:
             self.last = replace(self.last, frames=[])
 
-    sh_degree = _setting("sh_degree", "Highest degree of spherical harmonics, 0 to 3. May be set.")
-    nested_spp = _setting("nested_spp", "Samples per pixel of nested; 0: all's. May be set.")
-    smoothing = _setting("smoothing", "Filter of the own Gaussians (N,); None: off. May be set.")
-    error = _setting("error", "Error budget, 0..1; None: none. May be set: the next image chooses.")
-    budget_report = _setting("budget_report", "What ``error`` has chosen.")
-    gaussians = _setting("gaussians", "All rendered Gaussians, world space.")
-    pipeline = _setting("pipeline", "Stages that the settings select.")
-    near = _setting("near", "Near plane, scene units.")
-    ignore = _setting("ignore", "Effects that are not simulated.")
+    sh_degree = _setting("sh_degree", "Highest degree of spherical harmonics, 0 to 3.")
+    nested_spp = _setting("nested_spp", "Samples per pixel of the nested integrator; 0: all.")
+    smoothing = _setting("smoothing", "Smoothing filter of the own Gaussians (N,); None: off.")
+    error = _setting("error", "Error budget, 0..1; None: none. The next rendering chooses for it.")
+    budget_report = property(attrgetter("state.budget_report"), doc="What ``error`` has chosen.")
+    gaussians = property(attrgetter("state.gaussians"), doc="All rendered Gaussians, world space.")
+    pipeline = property(attrgetter("state.pipeline"), doc="Stages that the settings select.")
+    srgb_primitives = property(attrgetter("state.srgb_primitives"), doc="If images are linear.")
+    near = property(attrgetter("state.near"), doc="Near plane, scene units.")
+    ignore = property(attrgetter("state.ignore"), doc="Effects that are not simulated.")
 
     def use_projection(self, stage: ProjectionStage) -> None:
         """Project the Gaussians by another stage, such as one across several processes."""

@@ -111,13 +111,17 @@ class Declared:
             return value in self.registry
         return not self.words or value in self.words
 
+    def convert(self, value: Any) -> Any:
+        """Return a number of this kind, and all else unchanged."""
+        is_number = isinstance(value, Real) and not isinstance(value, bool)
+        return float(value) if self.kind is float and is_number else value
+
     def check(self, name: str, value: Any) -> Any:
-        """Return a value as it is used: of this kind, a decimal default rounded.
+        """Return a value of this kind.
 
         Raises TypeError for another type and ValueError outside of the limits, with the name.
         """
-        if self.kind is float and isinstance(value, Real) and not isinstance(value, bool):
-            value = self.default if value == self.decimal else float(value)
+        value = self.convert(value)
         if type(value) is not self.kind:
             raise TypeError(f"{name} must be {self.expected_values}, got {value!r}")
         if not self.allows(value):
@@ -211,7 +215,9 @@ class Approximations:
 
     def __post_init__(self) -> None:
         for name, declared in DECLARED.items():
-            object.__setattr__(self, name, declared.check(name, getattr(self, name)))
+            value = declared.check(name, getattr(self, name))
+            value = declared.default if value == declared.decimal else value
+            object.__setattr__(self, name, value)
 
     @staticmethod
     def from_values(values: Mapping[str, Value | None]) -> Approximations:
@@ -247,13 +253,15 @@ def from_ply_header(where: str, values: Mapping[str, Value]) -> dict[str, Value]
         note = f"{where}: specifies {format_names(unknown)}, which is not known here and ignored"
         warnings.warn(UserNote(note + hint), stacklevel=2)
     known: dict[str, Value] = {}
-    for name in (name for name in DECLARED if name in values):
+    for name, declared in DECLARED.items():
+        if name not in values:
+            continue
         try:
-            known[name] = DECLARED[name].check(name, values[name])
+            known[name] = declared.check(name, values[name])
         except (TypeError, ValueError):
             raise UserError(
-                f"{where}: the header's {name} must be {DECLARED[name].expected_values}, got "
-                f"{one_line(values[name], 60)}; correct the line, or remove it"
+                f"{where}: the header's {name} must be {declared.expected_values}, got "
+                f"{one_line(declared.convert(values[name]), 60)}; correct the line, or remove it"
             ) from None
     return known
 

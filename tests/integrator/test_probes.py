@@ -136,7 +136,7 @@ def test_invalid_probe_settings_are_refused():
     with pytest.raises(RuntimeError, match="probes must be ids of shapes and emitters, got none"):
         scene()
     with pytest.raises(RuntimeError, match="probe_fallback must be one of none, rays, got 'guess'"):
-        scene(probes="ball", unseen="guess")
+        scene(probes="ball", probe_fallback="guess")
     for name, message in (("bowl", "got 'bowl'; there are sky, ball"), ("sky", "infinitely far")):
         found = scene(probes=f"ball, {name}")
         with pytest.raises(PluginError, match=message):
