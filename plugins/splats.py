@@ -298,7 +298,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
             )
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         if mode != dr.ADMode.Primal and surfaces_in(scene):
-            from drgs.integrator.derivatives import check_derivatives
+            from drgs.integrator.light.derivatives import check_derivatives
 
             check_derivatives(self.state, scene, sensor, mode)
         with self._lock, dr.suspend_grad():

@@ -56,6 +56,11 @@ def sample_offsets(positions: SamplePositions) -> tuple[Float | float, Float | f
     return (positions.x, positions.y) if isinstance(positions, SamplePoints) else (0.5, 0.5)
 
 
+def decode(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
+    """Return linear radiance A D(C / A); color: C, display space; coverage: A, sum of weights."""
+    return coverage * mi.math.srgb_to_linear(color / dr.select(coverage > 0, coverage, 1))
+
+
 class CenterSamples:
     """A single sample per pixel, at its centre. Exact for a box filter."""
 

@@ -4,7 +4,7 @@ An :class:`ImageRender` has a :class:`SensorRender` for each sensor of a ``batch
 renders a frame (``drgs.splatting.rendering``) for each time of the shutter and each pass of
 samples, or reuses those of the last image, composites them over the background and adds the
 surfaces. The film develops the channels (``drgs.integrator.film``), and a nested integrator's image
-of surfaces is inserted (``drgs.integrator.surfaces``).
+of surfaces is inserted (``drgs.integrator.light.surfaces``).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from drgs.core.memory import MAX_LANES, UNASKED_BYTES, available_memory, too_lar
 from drgs.core.types import Float
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.film import CenterSamples, Channels, sample_offsets
+from drgs.integrator.film import CenterSamples, Channels, decode, sample_offsets
 from drgs.integrator.sensors import (
     SensorState,
     accumulate_in_sensor,
@@ -41,9 +41,9 @@ from drgs.splatting import rendering
 from drgs.splatting.footprint import SamplePositions
 
 if TYPE_CHECKING:  # imported where a scene requires them
+    from drgs.integrator.light.surfaces import NestedSurfaces
+    from drgs.integrator.light.visible_surfaces import SurfaceLayers
     from drgs.integrator.sensors import SideBySide
-    from drgs.integrator.surfaces import NestedSurfaces
-    from drgs.integrator.visible_surfaces import SurfaceLayers
 
 
 Passes = list[Channels]  # channels by pass: one sample per pixel or, on a small film, several
@@ -173,7 +173,7 @@ def nested_surfaces(
     """Return the surfaces in an image; None where the scene has none."""
     if not surfaces_in(scene):
         return None
-    from drgs.integrator.surfaces import NestedSurfaces
+    from drgs.integrator.light.surfaces import NestedSurfaces
 
     return NestedSurfaces.from_scene(splats, scene, sensor, seed, spp)
 
@@ -298,7 +298,7 @@ class SensorRender:
         """Return a sample's channels; layers: visible surfaces, None in a scene without any."""
         if layers is None:
             return self._to_channels(planes, mi.Float(1), behind, color)
-        from drgs.integrator.visible_surfaces import transmittance_behind
+        from drgs.integrator.light.visible_surfaces import transmittance_behind
 
         planes, fronts = planes[: -len(layers)], planes[-len(layers) :]
         pairs = list(zip(layers, fronts, strict=True))
@@ -409,7 +409,7 @@ class SensorRender:
     def _traced_surfaces(
         self, nested: NestedSurfaces, state: SensorState
     ) -> Cached[list[list[SurfaceLayers]]]:
-        from drgs.integrator.visible_surfaces import trace_surfaces
+        from drgs.integrator.light.visible_surfaces import trace_surfaces
 
         hides, (_, far) = self.splats.hide_emitters, depth_range(self.sensor)
         settings = nested.surfaces, self.key, hides, far, *state.settings
@@ -480,11 +480,6 @@ class _Background:
     colors: Iterable[Iterable[mi.Color3f]]  # by time and by pass; display space, or see below
     is_radiance: bool  # an environment: covers the film; its colours are linear where channels are
     radiance: Iterable[Iterable[mi.Color3f | None]]  # linear, of an environment or a texture
-
-
-def decode(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
-    """Return linear radiance A D(C / A); color: C, display space; coverage: A, sum of weights."""
-    return coverage * mi.math.srgb_to_linear(color / dr.select(coverage > 0, coverage, 1))
 
 
 def constant_background(splats: SplatsState) -> mi.Color3f | None:

@@ -73,7 +73,7 @@ class RenderCache:
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
     instances: list[mi.Shape] = field(default_factory=list)  # of the last scene, checked
     sensor: mi.Sensor | None = None  # rendered last
-    surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that has some
+    surfaces: Any = None  # drgs.integrator.light.surfaces.Surfaces of the last scene that has some
     too_close: frozenset[str] = frozenset()  # ids of objects with a logged warning
     shaded: Gaussians | None = None  # in the shadow of surfaces; None: no shadows
 

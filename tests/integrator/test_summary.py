@@ -28,7 +28,7 @@ MODULES = (
     "cameras.thin_prism_fisheye", "effects.defocus", "effects.occlusion",
     "effects.smoothing", "gaussians.rotation", "gaussians.similarity", "integrator.gathering",
     "integrator.light.splat_transport", "integrator.light.shadows",
-    "integrator.surfaces",
+    "integrator.light.surfaces",
     "light", "light.grid", "light.probe", "light.walk",
     "training.effects.background", "training.effects.cameras", "training.effects.colors",
     "training.effects.depth", "training.effects.masks", "training.effects.photometry",
@@ -322,7 +322,7 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "distorted": ["drgs.cameras.distortion", "drgs.cameras.radial_tangential"],
         "thin lens": ["drgs.effects.defocus"],
         "orthographic": ["drgs.cameras.orthographic"],
-        "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
+        "surface": ["drgs.effects.occlusion", "drgs.integrator.light.surfaces"],
         "path": [],
         "splatpath": [],
         "light": [

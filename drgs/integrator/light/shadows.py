@@ -25,8 +25,8 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.integrator.light.rays import StraightRays, has_transparent_parts
 from drgs.integrator.light.splat_transport import check_ids, ray_splats_of
+from drgs.integrator.light.surfaces import Surfaces, scene_of
 from drgs.integrator.state import SplatsState
-from drgs.integrator.surfaces import Surfaces, scene_of
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 

@@ -42,7 +42,7 @@ from drgs.config.approximations import Approximations
 from drgs.core.arrays import reinterpret
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.image_render import decode
+from drgs.integrator.film import decode
 from drgs.integrator.light.rays import PathSegment, SplatTransport, TransportIntegrator
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import SplatsState
