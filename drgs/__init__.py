@@ -10,8 +10,11 @@
 :func:`examine` tells which effects they call for, :func:`train` fits Gaussians to them, and
 :func:`rasterization` renders differentiably. :data:`EXAMPLE` is the file of a fitted crane truck.
 
-Importing ``drgs`` registers Mitsuba's plugins ``splats`` and ``calibrated`` for the active variant
-and for every later one. Public names are imported when they are first used.
+Importing ``drgs`` selects the LLVM that Dr.Jit will load, registers the plugins ``splats``,
+``splatpath``, ``calibrated`` and ``splats_minimal`` with each Mitsuba variant that is active or
+set later, and changes nothing else. To do so it puts at most two finders first on
+``sys.meta_path``: one finds no module, and notices when a variant of Mitsuba is imported; in a
+checkout, the other finds ``drgs.plugins``. Public names are imported when they are first used.
 """
 
 from __future__ import annotations
@@ -21,14 +24,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs import _registration
-from drgs.core import errors, llvm
+from drgs.core import llvm
 
 if TYPE_CHECKING:
     from drgs.datasets import load_dataset
+    from drgs.examine.examination import examine
+    from drgs.fit.session import train
     from drgs.gaussians.parameters import Gaussians
     from drgs.gsplat_api import rasterization
-    from drgs.training.examination import examine
-    from drgs.training.session import train
 
 __version__ = "0.1.0"
 
@@ -42,14 +45,13 @@ llvm.select_newest_llvm()
 llvm.check_llvm_variants()
 _registration.map_sibling_plugins()
 _registration.register_plugins()
-errors.show_causes_last()
 
 _MODULES = {
     "Gaussians": "drgs.gaussians.parameters",
-    "examine": "drgs.training.examination",
+    "examine": "drgs.examine.examination",
     "load_dataset": "drgs.datasets",
     "rasterization": "drgs.gsplat_api",
-    "train": "drgs.training.session",
+    "train": "drgs.fit.session",
 }
 
 

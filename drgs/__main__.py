@@ -12,12 +12,12 @@ from drgs.cli.commands import CommandParser, Subcommand, run_command
 from drgs.core.environment import describe_installation
 
 COMMANDS = {
-    "fit": Subcommand("fit 3D Gaussians to posed photographs", "drgs.fit"),
-    "examine": Subcommand("find out which effects photographs call for", "drgs.examination"),
+    "fit": Subcommand("fit 3D Gaussians to posed photographs", "drgs.fit.__main__"),
+    "examine": Subcommand("find out which effects photographs call for", "drgs.examine.__main__"),
     "poses": Subcommand("find out where photographs were taken", "drgs.poses.__main__"),
-    "render": Subcommand("render Gaussians, a fit, or a Mitsuba scene", "drgs.render"),
-    "export": Subcommand("write Gaussians for other programs", "drgs.export"),
-    "view": Subcommand("look at Gaussians in a browser, rendered live", "drgs.view"),
+    "render": Subcommand("render Gaussians, a fit, or a Mitsuba scene", "drgs.render.__main__"),
+    "export": Subcommand("write Gaussians for other programs", "drgs.export.__main__"),
+    "view": Subcommand("look at Gaussians in a browser, rendered live", "drgs.view.__main__"),
     "capture": Subcommand("turn a Mitsuba scene into a training set", "drgs.capture.__main__"),
     "bench": Subcommand("measure drgs; write tables and plots", "drgs.bench.__main__"),
 }

@@ -18,9 +18,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from drgs.bench.output import machine
+from drgs.cameras.orbits import orbit_of_gaussians
 from drgs.cli.commands import bounded_int
 from drgs.cli.ending import exit_on_user_error
-from drgs.datasets.orbits import orbit_of_gaussians
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.io.images import to_uint8

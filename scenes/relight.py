@@ -56,12 +56,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from drgs.bench.output import markdown_table
+from drgs.cameras.orbits import OPAQUE, orbit_of_gaussians
 from drgs.cli.ending import exit_on_user_error
 from drgs.config.approximations import from_ply_header
 from drgs.core.arrays import interleave
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
-from drgs.datasets.orbits import OPAQUE, orbit_of_gaussians
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.gaussians.sh import sh_basis
 from drgs.gaussians.similarity import Similarity

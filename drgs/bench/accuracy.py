@@ -40,9 +40,9 @@ from drgs.integrator.film import SamplePoints
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
-from drgs.render import error_budget
 from drgs.results import metrics
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS
+from drgs.results.model_arguments import error_budget
 from drgs.splatting import rendering
 from drgs.splatting.footprint import PixelCenters, SamplePositions
 

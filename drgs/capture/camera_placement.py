@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drgs.cameras.axes import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA
+from drgs.cameras.viewpoints import look_at
 from drgs.capture.path_tracing import (
     FAR_CLIP,
     MIN_LIT_PART,
@@ -30,7 +31,6 @@ from drgs.capture.path_tracing import (
 )
 from drgs.core.errors import UserError
 from drgs.core.types import Float
-from drgs.datasets.viewpoints import look_at
 
 KINDS = ("around", "inside", "sensors")
 

@@ -6,11 +6,12 @@ the spherical harmonics rises, coarse stages end) keep their share of the whole.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import reduce
 from typing import Any
 
 from drgs.config.schema import FitConfig
+from drgs.config.section import Section
 
 _COUNTS = (
     "densify.start",
@@ -89,3 +90,23 @@ def with_decisions(config: FitConfig, other: FitConfig) -> FitConfig:
 
 def _value(config: FitConfig, key: str) -> Any:
     return reduce(getattr, key.split("."), config)
+
+
+def given_keys(config: FitConfig) -> set[str]:
+    """Return the keys, as in ``colors.lr``, that the configuration's author has set.
+
+    A null counts, unless it leaves the value to the dataset. Of a configuration that was loaded
+    with all values, as a fit writes it, all are set.
+    """
+    keys = {f"extensions.{name}" for name in config.extensions} | set(_set_keys(config, ""))
+    values = {key: reduce(getattr, key.split("."), config) for key in OPEN_AT_START}
+    return keys - {key for key, value in values.items() if value is None}
+
+
+def _set_keys(section: Section, prefix: str) -> Iterator[str]:
+    for name in section.model_fields_set:
+        value = getattr(section, name)
+        if isinstance(value, Section):
+            yield from _set_keys(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}"

@@ -12,8 +12,8 @@ import drjit.llvm.ad as llvm
 import numpy as np
 
 from drgs.cameras.camera import Camera
+from drgs.cameras.viewpoints import Viewpoint
 from drgs.core.arrays import from_host, types_of
-from drgs.datasets.types import Viewpoint
 
 Columns = Sequence[np.ndarray]  # coordinates x, y, z, each (N,)
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from pydantic import BaseModel
 
+from drgs.cameras.viewpoints import panorama_intrinsics
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
@@ -45,7 +46,6 @@ from drgs.datasets.transforms import (
     focal_length,
     lens_of,
     motion_of,
-    panorama_intrinsics,
     principal_point,
     unique_names,
 )

@@ -18,12 +18,13 @@ from scipy.spatial import KDTree
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import PINHOLE
+from drgs.cameras.viewpoints import Viewpoint
 from drgs.cli.execution import select_variant
 from drgs.core.environment import VARIANTS, denormals_kept
 from drgs.core.errors import UserError, reason_of_mitsuba
 from drgs.datasets.film import is_projectable, shown_points
 from drgs.datasets.images import unread_image
-from drgs.datasets.types import Dataset, View, ViewFilter, Viewpoint
+from drgs.datasets.types import Dataset, View, ViewFilter
 from drgs.io.ply import read_points
 
 NUM_NEIGHBOURS = 3

@@ -31,13 +31,13 @@ from pydantic_core import ErrorDetails
 from pydantic_core.core_schema import no_info_after_validator_function
 
 from drgs.cameras.axes import between_opencv_and_opengl
+from drgs.cameras.viewpoints import MAX_COORDINATE, CameraMotion
 from drgs.config.schema import DataConfig
 from drgs.config.section import expectation
 from drgs.core.errors import UserError, format_names, one_line
 from drgs.core.files import read_text, shorten_stem
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.files import FileKind, find_files
-from drgs.datasets.types import CameraMotion
 from drgs.io.images import MAX_SIDE
 
 if TYPE_CHECKING:
@@ -49,8 +49,6 @@ RIGID_TOLERANCE = 1e-4
 """Largest entry of |R R^T - I|, 80 times that of float32 (1.3e-6), and error of the last row."""
 
 MEMORY_RATIO = 30  # memory that JSON takes as Python's objects, in bytes of the text
-
-MAX_COORDINATE = 1e9  # of a camera, scene units: far beyond what float32 resolves within a scene
 
 FOCAL_RANGE = (1e-2, 1e4)  # in image sizes: full angles of view from 178 degrees down to 0.006
 
@@ -434,11 +432,6 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
         return lens.from_coefficients(**given)
     except UserError as error:
         raise UserError(f"{frame.location('camera_model')}: {error}") from error
-
-
-def panorama_intrinsics(width: int, height: int) -> tuple[float, float, float, float]:
-    """Return fx, fy (px per radian), cx and cy (px) of a film that is a whole turn."""
-    return width / (2 * math.pi), height / math.pi, width / 2, height / 2
 
 
 def motion_of(frame: TransformsFrame, samples: int) -> CameraMotion | None:

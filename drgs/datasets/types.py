@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 
-from drgs.core.constants import SHUTTER_SAMPLES
+from drgs.cameras.viewpoints import Viewpoint
 from drgs.core.origin import WORLD, Origin
 
 if TYPE_CHECKING:
-    from drgs.cameras.lens import Lens
+    pass
 
 
 T = TypeVar("T")
@@ -56,71 +56,10 @@ def evenly_spaced(items: Sequence[T], most: int) -> tuple[T, ...]:
     return tuple(items[index] for index in chosen)
 
 
-@dataclass(frozen=True, eq=False)
-class CameraMotion:
-    """Motion of a camera while its shutter is open."""
-
-    close_to_world: np.ndarray  # (4, 4) float64, OpenCV axes: the pose at the end
-    shutter: str  # global: all pixels are exposed at once; rolling: row after row
-    samples: int = SHUTTER_SAMPLES  # global: times at which the image is rendered
-
-
-@dataclass(frozen=True, eq=False)
-class Viewpoint:
-    """A camera in the world, and the size of its image."""
-
-    name: str  # unique among those rendered together; a file name without folders or suffix
-    camera_to_world: np.ndarray  # (4, 4) float64, rigid, OpenCV axes: x right, y down, z forward
-    fx: float  # px
-    fy: float  # px
-    cx: float  # px; pixel centres are at (i + 0.5, j + 0.5)
-    cy: float  # px
-    width: int  # px
-    height: int  # px
-    lens: Lens | None = None  # with numbers of the host; None: a pinhole
-    motion: CameraMotion | None = None  # while the shutter is open; None: the camera does not move
-
-    @property
-    def center(self) -> np.ndarray:
-        """Position (3,) of the camera, world."""
-        return self.camera_to_world[:3, 3]
-
-    @property
-    def K(self) -> np.ndarray:  # noqa: N802
-        """Matrix (3, 3) float64 from camera coordinates to homogeneous pixel coordinates."""
-        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], np.float64)
-
-    @property
-    def viewmat(self) -> np.ndarray:
-        """Pose (4, 4) float64, world to camera, OpenCV axes, as ``drgs.rasterization`` takes it."""
-        rotation = self.camera_to_world[:3, :3].T
-        viewmat = np.eye(4)
-        viewmat[:3] = np.column_stack([rotation, -rotation @ self.center])
-        return viewmat
-
-    def with_offset(self: V, offset: np.ndarray) -> V:
-        """Return the same camera with ``offset`` (3,) added to its position."""
-        if not np.any(offset):
-            return self
-        pose, motion = _translate_pose(self.camera_to_world, offset), self.motion
-        if motion is not None:
-            motion = replace(motion, close_to_world=_translate_pose(motion.close_to_world, offset))
-        return replace(self, camera_to_world=pose, motion=motion)
-
-
-V = TypeVar("V", bound=Viewpoint)
-
-
 def _spread(views: Sequence[Viewpoint]) -> float:
     centers = np.stack([view.center for view in views])
     distances = np.linalg.norm(centers - centers.mean(axis=0), axis=1)
     return float(1.1 * distances.max())
-
-
-def _translate_pose(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    pose = pose.copy()
-    pose[:3, 3] += offset
-    return pose
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

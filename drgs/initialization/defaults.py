@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
+from drgs.cameras.viewpoints import focus_of
 from drgs.config.changes import with_changes
 from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.types import Dataset
-from drgs.datasets.viewpoints import focus_of
 
 NEAR_SHARE = 0.04
 """The near plane is this share of the cameras' distance to their focus, rounded to one digit: the

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from typing_extensions import override
 
+from drgs.cameras.viewpoints import Viewpoint, focus_of, is_panorama
 from drgs.config.schema import InitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.film import to_camera, to_film
-from drgs.datasets.types import Dataset, Viewpoint
-from drgs.datasets.viewpoints import focus_of, is_panorama
+from drgs.datasets.types import Dataset
 
 MIN_DISTANCE = 0.25  # of starting points to cameras, in distances to the focus
 

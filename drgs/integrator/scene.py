@@ -12,10 +12,10 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
+from drgs.cameras.viewpoints import Viewpoint
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 from drgs.core.memory import too_large_reason
-from drgs.datasets.types import Viewpoint
 from drgs.gaussians.parameters import Gaussians
 
 NEAR_CLIP = 1e-9  # scene units: the smallest near plane, so that the integrator's applies

@@ -1,7 +1,7 @@
 """Summary of simulated effects, the reason for each, and of effects that are not simulated.
 
 Commands print one at their start, a line an effect: :func:`summary_of_sensors` for a Mitsuba scene,
-:func:`summary_of_views` for images of Gaussians, ``drgs.training.summary`` for a fit.
+:func:`summary_of_views` for images of Gaussians, ``drgs.fit.summary`` for a fit.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
-from drgs.datasets.types import Viewpoint
+from drgs.cameras.viewpoints import Viewpoint
 from drgs.effects.compose import without_effects
 from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
 from drgs.integrator.state import SplatsState, surfaces_in

@@ -26,7 +26,6 @@ from PIL import ExifTags, Image
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from drgs.core.child_process import ChildEndedError, DeferredInterrupts, run_in_child
 from drgs.core.environment import require_module
 from drgs.core.errors import UserError, UserNote, format_names, one_line
 from drgs.core.files import refusal_reason
@@ -36,6 +35,7 @@ from drgs.datasets.files import is_image, masks_of, without_masks
 from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
 from drgs.io.images import check_readable, image_size, write_png
+from drgs.poses.child_process import ChildEndedError, DeferredInterrupts, run_in_child
 
 if TYPE_CHECKING:
     import pycolmap

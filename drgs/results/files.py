@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 CONFIG = "config.yml"  # every value of the configuration; marks whose folder it is
-CHECKPOINT = "checkpoint.npz"  # while the fit runs: see :mod:`drgs.training.checkpoint`
+CHECKPOINT = "checkpoint.npz"  # while the fit runs: see :mod:`drgs.fit.checkpoint`
 GAUSSIANS = "point_cloud.ply"
 GAUSSIANS_FOR_VIEWERS = "point_cloud_viewers.ply"  # for viewers without our approximations
 HISTORY = "history.csv"

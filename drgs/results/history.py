@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from drgs.core.files import atomic_path
+from drgs.training.density.strategy import DensityReport
 
 
 @dataclass(frozen=True)
@@ -21,19 +22,6 @@ class HistoryRow:
     means_lr: float  # world units
     wall_s: float  # since the first iteration
     test_psnr: float | None = None  # dB, mean of some test views; None: not measured here
-
-
-@dataclass(frozen=True)
-class DensityReport:
-    """Changes of the rows by one call of a density strategy."""
-
-    num_gaussians: int  # afterwards
-    num_added: int = 0  # new rows, without split parents
-    cloned: int = 0  # copied Gaussians
-    split: int = 0  # Gaussians replaced by several
-    relocated: int = 0  # rows replaced by copies of others
-    pruned: int = 0  # removed rows, without split parents
-    refused: int = 0  # Gaussians not cloned or split because of the limit
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, TypeVar
 import mitsuba as mi
 import numpy as np
 
+from drgs.cameras.orbits import near_plane_of
+from drgs.cameras.viewpoints import Viewpoint
 from drgs.config.approximations import from_ply_header
 from drgs.config.changes import is_open
 from drgs.config.load import load_config
@@ -21,8 +23,6 @@ from drgs.core.errors import PluginError, UserError, format_names
 from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets import Dataset, load_dataset
-from drgs.datasets.orbits import near_plane_of
-from drgs.datasets.types import Viewpoint
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import (

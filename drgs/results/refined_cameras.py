@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cameras.axes import between_opencv_and_opengl
+from drgs.cameras.viewpoints import Viewpoint
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import atomic_path, read_text
 from drgs.core.origin import WORLD, Origin
+from drgs.datasets.camera_file import read_viewpoints
 from drgs.datasets.transforms import CLOSE_POSE_KEY, MAX_BYTES
-from drgs.datasets.types import Dataset, View, Viewpoint
-from drgs.datasets.viewpoints import read_viewpoints
+from drgs.datasets.types import Dataset, View
 from drgs.results.files import CAMERAS, VIEWS
 from drgs.results.folder import load_run_config
 

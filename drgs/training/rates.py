@@ -10,6 +10,18 @@ from drgs.config.changes import with_changes
 from drgs.config.density import StopAim
 from drgs.config.schema import FitConfig
 
+TOUCH_UP_RATES = {
+    "means_lr": 1.6e-5,
+    "means_lr_final": 1.6e-5,
+    "quats_lr": 4e-3,
+    "scales_lr": 0.02,
+    "opacities_lr": 0.07,
+    "sh0_lr": 0.03,
+    "shN_lr": 4e-3,
+    "decay": 0.1,
+}
+"""Learning rates of a few iterations after a fit: high because they are few."""
+
 
 @dataclass(frozen=True)
 class ExponentialDecay:

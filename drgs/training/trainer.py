@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import cast
@@ -42,7 +42,6 @@ from drgs.training.effects.base import (
 )
 from drgs.training.finite_checks import GradientWatch, WatchedIteration, check_values
 from drgs.training.losses import Loss, make_loss, make_loss_terms
-from drgs.training.memory import room_for_targets
 from drgs.training.optimizer import (
     make_optimizer,
     optimizer_state,
@@ -54,6 +53,7 @@ from drgs.training.parallel.population import check_shardable, local_gaussians, 
 from drgs.training.rates import rates_over_time, revised_plan
 from drgs.training.read_ahead import ReadAhead
 from drgs.training.steps import (
+    MAX_TARGET_BYTES,
     Step,
     StepView,
     ViewGradients,
@@ -105,10 +105,13 @@ class Trainer:
         density: DensityStrategy | None = None,
         effects: Sequence[TrainingEffect] = (),
         loss: Loss | None = None,
+        *,
+        room: Callable[[int], int] = lambda pixel_bytes: MAX_TARGET_BYTES,
     ) -> None:
         """gaussians: all, on each process; comm: None: this process alone.
 
-        density, loss: None: the configured ones; effects: besides the configured ones.
+        density, loss: None: the configured ones; effects: besides the configured ones. room: bytes
+        of targets and uploads that may stay on the device, given those of a pixel.
         """
         config = resolve_defaults(config, dataset)
         views_per_step = config.optimizer.views_per_step
@@ -117,10 +120,8 @@ class Trainer:
         check_shardable(config, comm.size, gaussians.num_gaussians)
         self.effects = training_effects(config, dataset, effects)
         self._given_density, self._given_effects, self._given_loss = density, effects, loss
-        pixel_bytes = bytes_per_pixel(self.effects)
-        room = comm.collective(
-            lambda: room_for_targets(config, dataset, gaussians, pixel_bytes, comm)
-        )
+        self._room = room
+        room_bytes = comm.collective(lambda: room(bytes_per_pixel(self.effects)))
         self.scene = make_scene(
             local_gaussians(gaussians, comm),
             config.model,
@@ -140,7 +141,7 @@ class Trainer:
         )
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)
-        self.stages = make_stages(dataset.train, config, self.effects, room)
+        self.stages = make_stages(dataset.train, config, self.effects, room_bytes)
         self.read_ahead = ReadAhead(dataset.train, views_per_step, comm)
         self.gradients: WholeGradients | ViewExchange = WholeGradients(self.integrator)
         if views_per_step > 1:
@@ -432,7 +433,9 @@ class Trainer:
         config: of another fit, which decides about its population.
         """
         effects, loss = deepcopy((self._given_effects, self._given_loss))
-        return Trainer(config, self.dataset, gaussians, self.comm, effects=effects, loss=loss)
+        return Trainer(
+            config, self.dataset, gaussians, self.comm, effects=effects, loss=loss, room=self._room
+        )
 
     def warm_start(self, former: Trainer) -> None:
         """Begin after the iterations of another trainer, with the state of its effects."""

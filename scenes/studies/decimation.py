@@ -14,16 +14,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from drgs.bench.output import machine, markdown_table
-from drgs.gaussians.merging import merge_down
+from drgs.export.decimation import decimate
+from drgs.export.merging import merge_down
+from drgs.export.selection import take
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.selection import take
 from drgs.integrator.scene import make_scene, make_sensors, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.io.figures import new_figure, write_figure
 from drgs.results import metrics
 from drgs.results.model import load_model
 from drgs.splatting import rendering
-from drgs.training.decimation import decimate
 
 SHARES = (75, 50, 35, 25, 10)  # percent
 

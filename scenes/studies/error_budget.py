@@ -27,9 +27,9 @@ from drgs.accuracy import error_budget as budgets
 from drgs.bench.output import machine, markdown_table
 from drgs.bench.scenes import bench_gaussians, device_camera, stress_scene
 from drgs.cameras.camera import Camera
+from drgs.cameras.orbits import orbit_of_gaussians
+from drgs.cameras.viewpoints import FIELD_OF_VIEW
 from drgs.config.approximations import Approximations
-from drgs.datasets.orbits import orbit_of_gaussians
-from drgs.datasets.viewpoints import FIELD_OF_VIEW
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.error_budget import renderer_of
 from drgs.integrator.scene import make_sensors

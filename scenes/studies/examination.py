@@ -23,9 +23,9 @@ from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.datasets.folders import config_for
 from drgs.datasets.types import Dataset, View
+from drgs.examine.examination import Examination, with_background
 from drgs.io.images import read_image
 from drgs.results.alignment import align
-from drgs.training.examination import Examination, with_background
 from scipy.spatial.transform import Rotation
 
 NUM_CASES = 10

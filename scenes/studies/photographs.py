@@ -29,6 +29,7 @@ from drgs.core.environment import require_module
 from drgs.datasets import load_dataset
 from drgs.datasets.colmap import image_folder, require_model
 from drgs.datasets.folders import config_for, find_reader
+from drgs.fit.report import score
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.io.colmap import read_model
@@ -37,7 +38,6 @@ from drgs.poses.structure_from_motion import SfmSettings, reconstruct
 from drgs.results.files import GAUSSIANS
 from drgs.results.folder import load_run_config
 from drgs.results.metrics import mean_of
-from drgs.results.report import score
 from fits import add_case_option, fit_words, make_parser
 
 JPEG_QUALITY = 95

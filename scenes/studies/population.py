@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
-from drgs import fit
 from drgs.bench.output import markdown_table
 from drgs.capture import __main__ as capture
 from drgs.config.load import load_config
 from drgs.config.schema import DensifyConfig, FitConfig
 from drgs.datasets import load_dataset
+from drgs.fit import __main__ as fit
 from drgs.results.files import HISTORY
 from drgs.training.density.adc import AdaptiveDensityControl
 from drgs.training.density.strategy import DensityReport, Population

@@ -19,11 +19,11 @@ from drgs.config.load import config_from
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UnsupportedError
 from drgs.core.registry import ExtensionError, reporting_extensions, temporary_registrations
+from drgs.fit.summary import summary_of_fit
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import ProjectionModel, ewa
 from drgs.splatting.rendering import CenterOrder, render
 from drgs.testing import Case, adjoint_is_transpose, gradients_equal_differences
-from drgs.training.summary import summary_of_fit
 
 K = np.array([[30.0, 0, 14], [0, 33, 11], [0, 0, 1]])
 WIDTH, HEIGHT = 28, 22

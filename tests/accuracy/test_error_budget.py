@@ -14,7 +14,6 @@ from support.render_command import run, sensor, write_scene
 from support.small_capture import pose_around
 from support.views import Scene, tensors
 
-from drgs import render, view
 from drgs.accuracy import error_budget as budgets
 from drgs.bench.scenes import device_camera, stress_scene
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
@@ -28,8 +27,10 @@ from drgs.integrator.scene import film_description
 from drgs.io.scenes import openexr_threads
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
+from drgs.render import __main__ as render
 from drgs.results.model import load_model
 from drgs.splatting.footprint import GaussianFalloff
+from drgs.view import __main__ as view
 
 SIZE, BLACK = 48, (0.0, 0.0, 0.0)
 SCENE = Scene(count=300)

@@ -22,12 +22,12 @@ from support.commands import run_in_process
 
 import drgs
 from drgs import __main__ as commands
-from drgs import fit
 from drgs.bench import __main__ as bench
 from drgs.cli.commands import CommandParser, bounded_int, file_or_folder, finite_number, run_command
 from drgs.cli.ending import escape_unencodable
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import atomic_path
+from drgs.fit import __main__ as fit
 from drgs.io.images import image_size, write_png
 
 

@@ -26,13 +26,14 @@ from support.formats import (
 from support.html_page import HtmlPage
 from support.small_capture import blobs, make_dataset
 
-from drgs import export, render
+from drgs.export import __main__ as export
+from drgs.export import decimation
+from drgs.export import mesh as surface
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.formats import read_gaussians, writable_formats
 from drgs.io.ply import read_points
-from drgs.results import surface
+from drgs.render import __main__ as render
 from drgs.results.refined_cameras import write_views
-from drgs.training import decimation
 
 FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 VIEWER_RENDERING = {"antialiased": False, "low_pass": 0.3}

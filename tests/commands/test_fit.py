@@ -29,11 +29,11 @@ from support.viewer_rendering import VIEWER_RENDERING
 
 from drgs.config.changes import with_changes
 from drgs.core.errors import UserNote
+from drgs.fit import budget
+from drgs.fit.report import Seconds
+from drgs.fit.viewers_fit import TIME_SHARE
 from drgs.gaussians.parameters import Gaussians
-from drgs.results.report import Seconds
-from drgs.training import budget
 from drgs.training.trainer import Trainer
-from drgs.training.viewers import TIME_SHARE
 
 OUTPUTS = (
     *("point_cloud.ply", "metrics.json", "history.csv", "density.csv", "config.yml"),

@@ -25,12 +25,12 @@ from support.fit_command import (
 from support.folders import contents, visible
 from support.small_capture import blobs
 
-from drgs import render
 from drgs.config.load import load_config
 from drgs.core.folders import sole_writer
+from drgs.fit import session
+from drgs.fit.loop import StopCriterion
+from drgs.render import __main__ as render
 from drgs.results.folder import continue_run
-from drgs.training import session
-from drgs.training.loop import StopCriterion
 
 POINTS = "out/point_cloud.ply"
 

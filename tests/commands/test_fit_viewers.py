@@ -26,17 +26,17 @@ from support.render_command import run as render
 from support.small_capture import HEIGHT, WIDTH, decibels, pose_around
 from support.small_fits import double, photograph
 
-from drgs import fit
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset
+from drgs.fit import __main__ as fit
+from drgs.fit import fit_folder
+from drgs.fit import live_view as training_viewer
+from drgs.fit.live_view import EarlyStop, TrainingViewer
 from drgs.gaussians.parameters import Gaussians
+from drgs.live_page.frames import FrameRequest, ViewerCamera
+from drgs.live_page.scheduler import RenderRequests
 from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS
 from drgs.results.folder import remove_run
-from drgs.training import fit_folder
-from drgs.viewer import training_viewer
-from drgs.viewer.frames import FrameRequest, ViewerCamera
-from drgs.viewer.scheduler import RenderRequests
-from drgs.viewer.training_viewer import EarlyStop, TrainingViewer
 
 EYE = ViewerCamera(pose_around(0.4, 0.3), 40.0, 4.0)
 
@@ -47,12 +47,12 @@ def viewer_page(monkeypatch):
 
     Its user ends the fit after 4 iterations.
     """
-    server = ModuleType("drgs.viewer.server")
+    server = ModuleType("drgs.live_page.server")
     server.run_server = lambda *_: nullcontext("server")
     server.url, server.ADDRESS = lambda _: "http://here", "127.0.0.1"
-    monkeypatch.setitem(sys.modules, "drgs.viewer.server", server)
+    monkeypatch.setitem(sys.modules, "drgs.live_page.server", server)
     monkeypatch.setitem(sys.modules, "viser", ModuleType("viser"))
-    monkeypatch.setattr("drgs.viewer.training_viewer.PROGRESS_SECONDS", 0.0)
+    monkeypatch.setattr("drgs.fit.live_view.PROGRESS_SECONDS", 0.0)
     without_images(monkeypatch)
     screen = Mock()
 
@@ -177,7 +177,7 @@ def test_resumed_fit_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
     config = write_project(tmp_path, model={**VALUES["model"], **FITTED_WITH})
     without_images(monkeypatch)
     with monkeypatch.context() as broken:
-        broken.setattr("drgs.training.viewers.for_viewers", lambda *_: sys.exit(7))
+        broken.setattr("drgs.fit.viewers_fit.for_viewers", lambda *_: sys.exit(7))
         with pytest.raises(SystemExit):
             fit.main([str(config), "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
@@ -190,10 +190,10 @@ def test_resumed_fit_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
 
 def test_fit_with_viewer_approximations_writes_one_file(tmp_path, monkeypatch):
     without_images(monkeypatch)
-    monkeypatch.delitem(sys.modules, "drgs.training.viewers", raising=False)
+    monkeypatch.delitem(sys.modules, "drgs.fit.viewers_fit", raising=False)
     monkeypatch.delitem(sys.modules, "drgs.effects.smoothing", raising=False)
     assert_fits(write_project(tmp_path), "--out", tmp_path / "out")
     assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
     assert "viewers" not in json.loads((tmp_path / "out" / METRICS).read_text())
-    assert not {"drgs.training.viewers", "drgs.effects.smoothing"} & set(sys.modules)
+    assert not {"drgs.fit.viewers_fit", "drgs.effects.smoothing"} & set(sys.modules)
     assert Gaussians.load(tmp_path / "out" / GAUSSIANS).rendered_with is None

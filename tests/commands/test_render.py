@@ -38,10 +38,10 @@ from support.small_capture import (
     write_fit,
 )
 
-from drgs import export
+from drgs.cameras.orbits import orbit_of_gaussians, orbit_of_views
 from drgs.core.errors import UserNote
 from drgs.datasets import load_dataset
-from drgs.datasets.orbits import orbit_of_gaussians, orbit_of_views
+from drgs.export import __main__ as export
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import effects
 from drgs.reference import splatting as reference

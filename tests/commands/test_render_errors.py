@@ -17,9 +17,9 @@ from support.small_capture import (
     write_fit,
 )
 
-from drgs import render
 from drgs.core import memory
 from drgs.core.folders import sole_writer
+from drgs.render import __main__ as render
 
 
 @pytest.fixture(autouse=True)

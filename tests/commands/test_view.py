@@ -10,13 +10,13 @@ from support.commands import assert_refused
 from support.small_capture import FOCUS, RADIUS, make_dataset
 
 import drgs
-from drgs import view
 from drgs.cli.commands import CommandParser
 from drgs.core.errors import UserError
+from drgs.live_page.page import StartView
 from drgs.results.files import CAMERAS, VIEWS
 from drgs.results.model import load_model
 from drgs.results.refined_cameras import write_views
-from drgs.viewer.page import StartView
+from drgs.view import __main__ as view
 
 
 def opened(*arguments):

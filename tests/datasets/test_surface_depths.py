@@ -10,11 +10,12 @@ from support.lens_scenes import LENSES, PINHOLE, kernel_lens, points_at
 from support.small_capture import make_dataset, write_dataset
 from support.small_fits import reference_camera
 
+from drgs.cameras.viewpoints import CameraMotion
 from drgs.config.load import config_from
 from drgs.core.errors import UserError
 from drgs.datasets import load_dataset
 from drgs.datasets.surface_depths import with_depths_from
-from drgs.datasets.types import CameraMotion, all_views
+from drgs.datasets.types import all_views
 
 LENSES = {"pinhole": PINHOLE, **LENSES}
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from support.small_capture import FIELD_OF_VIEW, FOCUS, RADIUS, blobs, pose_around, view
 
+from drgs.cameras.orbits import Orbit, near_plane_of, orbit_of_gaussians, orbit_of_views, up_of
+from drgs.cameras.viewpoints import look_at
 from drgs.core.errors import UserError, UserNote
-from drgs.datasets.orbits import Orbit, near_plane_of, orbit_of_gaussians, orbit_of_views, up_of
-from drgs.datasets.viewpoints import look_at, read_viewpoints
+from drgs.datasets.camera_file import read_viewpoints
 
 pytestmark = pytest.mark.filterwarnings("error")  # no camera makes NumPy warn
 

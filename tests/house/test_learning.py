@@ -6,13 +6,13 @@ import re
 import pytest
 from conftest import REPOSITORY
 
-from drgs import render
 from drgs.config.schema import FitConfig
 from drgs.core import constants, memory
 from drgs.datasets import transforms
 from drgs.integrator import image_render
 from drgs.io import images
 from drgs.reference import splatting
+from drgs.render import __main__ as render
 
 REFERENCE = "drgs/reference/splatting.py"
 

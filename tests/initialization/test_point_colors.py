@@ -14,7 +14,7 @@ from support.analytic_shapes import (
     together,
 )
 
-from drgs.datasets.types import CameraMotion
+from drgs.cameras.viewpoints import CameraMotion
 from drgs.initialization import point_colors
 from drgs.initialization.point_colors import colors_from_images
 

@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 from support.datasets import dataset_of, edit, load, load_noting, put, view_at, write_points
 
+from drgs.cameras.viewpoints import focus_of, panorama
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
-from drgs.datasets.viewpoints import focus_of, panorama
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import (
     description_of_start,

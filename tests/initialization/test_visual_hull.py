@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.analytic_shapes import box, images_of, opaque_at, sphere, together
 
-from drgs.datasets.types import CameraMotion
+from drgs.cameras.viewpoints import CameraMotion
 from drgs.initialization.start_box import Box
 from drgs.initialization.visual_hull import are_masks, hull_points, silhouettes_of
 from drgs.reference import effects as reference

@@ -18,9 +18,10 @@ from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.lens import Pinhole
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
+from drgs.cameras.viewpoints import CameraMotion
 from drgs.config.approximations import Approximations
 from drgs.config.schema import DataConfig, ModelConfig
-from drgs.datasets.types import CameraMotion, View
+from drgs.datasets.types import View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import SQUARE_PIXEL_TOLERANCE, make_scene, make_sensors, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor

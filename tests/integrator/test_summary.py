@@ -14,13 +14,13 @@ from support.views import VIEWS, Scene, tensors
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
+from drgs.cameras.viewpoints import CameraMotion
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
-from drgs.datasets.types import CameraMotion
+from drgs.fit.summary import summary_of_fit
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import format_effects, summary_of_sensors, summary_of_views
 from drgs.training.effects.base import integrator_settings, training_effects
-from drgs.training.summary import summary_of_fit
 
 MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
@@ -237,7 +237,7 @@ mi.set_variant("llvm_ad_rgb")
 from dataclasses import replace
 from drgs.bench import scenes
 from drgs.training.effects.base import training_effects
-from drgs.training.summary import summary_of_fit
+from drgs.fit.summary import summary_of_fit
 from support import small_capture as capture
 from support.viewer_rendering import VIEWER_RENDERING
 from drgs.config.changes import with_changes

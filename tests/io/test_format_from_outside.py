@@ -10,11 +10,12 @@ import pytest
 from support.commands import assert_ends_well
 from support.small_capture import blobs
 
-from drgs import export, render
 from drgs.core import registry
 from drgs.core.errors import UserError
+from drgs.export import __main__ as export
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io import formats
+from drgs.render import __main__ as render
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "tests" / "examples" / "npz_format.py"

@@ -23,12 +23,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from support.small_capture import FOCUS, RADIUS, decibels, pose_around
 
+from drgs.cameras.viewpoints import pinhole
 from drgs.config.approximations import Approximations
 from drgs.config.schema import ModelConfig
-from drgs.datasets.viewpoints import pinhole
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.results.viewer import DisplaySettings, InitialView, viewer_page
+from drgs.results.html_viewer import DisplaySettings, InitialView, viewer_page
 
 fcntl = pytest.importorskip("fcntl", reason="needs POSIX")
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drgs import fit
-from drgs.training import fit_folder
+from drgs.fit import __main__ as fit
+from drgs.fit import fit_folder
 from drgs.training.trainer import Trainer
 from support.commands import assert_ends_well, assert_refused, run_in_process
 from support.small_capture import make_dataset, write_dataset

@@ -22,8 +22,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from drgs.cameras.viewpoints import CameraMotion
 from drgs.datasets.images import without_images
-from drgs.datasets.types import CameraMotion, View
+from drgs.datasets.types import View
 from drgs.initialization.defaults import resolve_defaults
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.parallel.communicator import Communicator

@@ -3,7 +3,7 @@
 import imageio.v3 as iio
 import numpy as np
 
-from drgs import render
+from drgs.render import __main__ as render
 from support.small_capture import (
     FIELD_OF_VIEW,
     FOCUS,

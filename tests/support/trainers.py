@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from drgs.cameras.viewpoints import look_at
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.datasets.types import Dataset, View
-from drgs.datasets.viewpoints import look_at
 from drgs.initialization.start import Start, gaussians_at
 
 

@@ -16,10 +16,10 @@ from support.small_fits import CAMERA_RATES, photometric_loss
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
+from drgs.cameras.viewpoints import CameraMotion
 from drgs.core.errors import UserError
+from drgs.datasets.camera_file import read_viewpoints
 from drgs.datasets.images import smaller_view
-from drgs.datasets.types import CameraMotion
-from drgs.datasets.viewpoints import read_viewpoints
 from drgs.integrator.scene import render_views
 from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import refined_dataset

@@ -11,11 +11,11 @@ from drgs.cli.commands import CommandParser
 from drgs.config.changes import with_changes
 from drgs.config.load import config_from, dump_config, load_config
 from drgs.core.errors import UserError
-from drgs.fit import add_arguments
+from drgs.fit.__main__ import add_arguments
+from drgs.fit.summary import summary_of_fit
 from drgs.integrator.summary import format_effects
 from drgs.training.effects.base import training_effects
 from drgs.training.losses import prepare_target
-from drgs.training.summary import summary_of_fit
 
 
 @pytest.fixture(autouse=True)

@@ -13,9 +13,9 @@ from support.fit_command import assert_fits, run_fit, without_images, write_scen
 from support.folders import visible
 from support.trainers import make_trainer
 
+from drgs.fit import session
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.splatting import rendering
-from drgs.training import session
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.losses import prepare_target
 from drgs.training.steps import view_of

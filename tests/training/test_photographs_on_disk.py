@@ -22,7 +22,7 @@ from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError
 from drgs.datasets import images, reader, storage
 from drgs.datasets.storage import DiskStore, is_on_disk, scratch_folder
-from drgs.training import memory
+from drgs.fit import memory
 from drgs.training.read_ahead import NUM_AHEAD
 from drgs.training.steps import view_of
 from drgs.training.trainer import Trainer

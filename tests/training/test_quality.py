@@ -3,9 +3,9 @@
 import pytest
 from support.small_fits import everything_of, make_trainer, steps, test_psnr, true_dataset
 
+from drgs.fit import loop as quality
+from drgs.fit.loop import History, HistoryRow
 from drgs.results.history import DENSITY_COLUMNS, DensityReport, write_density, write_history
-from drgs.training import loop as quality
-from drgs.training.loop import History, HistoryRow
 
 
 def row(iteration, test_psnr=None):
@@ -54,7 +54,7 @@ def test_measuring_does_not_change_the_fit():
 
 def test_measuring_does_not_count_as_training_time(monkeypatch):
     now = iter([0.0, 5.0])
-    monkeypatch.setattr("drgs.training.loop.time.perf_counter", lambda: next(now))
+    monkeypatch.setattr("drgs.fit.loop.time.perf_counter", lambda: next(now))
     history = History()
     history.leave_out(2.0)
     assert history.wall_s == 3.0

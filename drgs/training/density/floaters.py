@@ -12,17 +12,17 @@ from typing_extensions import override
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import PINHOLE
+from drgs.cameras.viewpoints import Viewpoint
 from drgs.config.approximations import Approximations
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import types_of
 from drgs.core.types import Float, TensorXf
-from drgs.datasets.types import Dataset, Viewpoint, evenly_spaced
+from drgs.datasets.types import Dataset, evenly_spaced
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.results.history import DensityReport
 from drgs.splatting import rendering
 from drgs.splatting.rendering import depth_feature
-from drgs.training.density.strategy import DensityStrategy, Population
+from drgs.training.density.strategy import DensityReport, DensityStrategy, Population
 
 SHARES = (0.5, 0.7, 0.9)  # of the iterations, after which floaters are removed
 

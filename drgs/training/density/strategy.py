@@ -24,8 +24,20 @@ from drgs.core.arrays import from_host, types_of
 from drgs.core.types import Array2f, Bool, Float, TensorXf
 from drgs.datasets.types import Dataset
 from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.results.history import DensityReport
 from drgs.training.optimizer import Population
+
+
+@dataclass(frozen=True)
+class DensityReport:
+    """Changes of the rows by one call of a density strategy."""
+
+    num_gaussians: int  # afterwards
+    num_added: int = 0  # new rows, without split parents
+    cloned: int = 0  # copied Gaussians
+    split: int = 0  # Gaussians replaced by several
+    relocated: int = 0  # rows replaced by copies of others
+    pruned: int = 0  # removed rows, without split parents
+    refused: int = 0  # Gaussians not cloned or split because of the limit
 
 
 @dataclass(frozen=True)

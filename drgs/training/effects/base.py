@@ -143,7 +143,7 @@ class TrainingEffect(Protocol):
     def look_for(cls, fit: ShortFit) -> Finding | None:
         """Return what a short fit without the effect shows of it; None: nothing can be said.
 
-        See :mod:`drgs.training.examination`, which tries and chooses what is likely.
+        See :mod:`drgs.examine.examination`, which tries and chooses what is likely.
         """
         return None
 

@@ -23,9 +23,9 @@ import numpy as np
 import yaml
 from plyfile import PlyData, PlyElement
 
-from drgs import fit
 from drgs.capture import __main__ as capture
 from drgs.core.files import atomic_path
+from drgs.fit import __main__ as fit
 from drgs.results.files import CHECKPOINT, CURVES, ORBIT, ORBIT_GIF, REPORT, VIEWER
 from support.attacks.attack import Fault, observed
 from support.commands import assert_ends_well, run_in_process
@@ -160,7 +160,7 @@ def stub_results() -> Iterator[None]:
             with atomic_path(out / name) as temporary:
                 temporary.write_text("a sketch")
 
-    with patch("drgs.training.fit_folder.write_results", write):
+    with patch("drgs.fit.fit_folder.write_results", write):
         yield
 
 

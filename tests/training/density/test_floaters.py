@@ -7,9 +7,9 @@ import pytest
 from drjit.llvm.ad import TensorXf64
 from support.populations import make, moments, rows_of, values
 
+from drgs.cameras.viewpoints import look_at, pinhole
 from drgs.config.approximations import Approximations
 from drgs.config.schema import FitConfig
-from drgs.datasets.viewpoints import look_at, pinhole
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
 from drgs.training.density.floaters import Floaters

@@ -13,7 +13,7 @@ from support.datasets import edit, load
 from support.small_capture import make_dataset, write_dataset
 
 from drgs.core.errors import UserError
-from drgs.datasets.fingerprint import fingerprint_of
+from drgs.fit.fingerprint import fingerprint_of
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.images import write_png
 
@@ -31,7 +31,7 @@ SETTINGS = (
 @pytest.fixture
 def agreement():
     pytest.importorskip("mpi4py", reason="the extra mpi is not installed")
-    from drgs.training.parallel import inputs as agreement
+    from drgs.fit import inputs as agreement
 
     return agreement
 

@@ -48,7 +48,7 @@ def test_rank_is_read_from_launcher_variables(monkeypatch):
 def test_single_process_does_not_import_the_parallel_package(run_python, tmp_path):
     code = (
         "import sys; sys.modules['mpi4py'] = None\n"
-        "from drgs import fit\n"
+        "from drgs.fit import __main__ as fit\n"
         "from drgs.training.trainer import Trainer\n"
         "print([m for m in sys.modules if m.startswith(('mpi4py.', 'drgs.training.parallel.ex'))])"
     )
@@ -59,7 +59,7 @@ def test_single_process_does_not_import_the_parallel_package(run_python, tmp_pat
 def test_launcher_of_another_mpi_is_refused(run_python):
     """Each of its processes would fit alone, into the same folder."""
     pytest.importorskip("mpi4py", reason="the extra mpi is not installed")
-    code = "from drgs.fit import main; main(['scenes/lego_mini.yml'])"
+    code = "from drgs.fit.__main__ import main; main(['scenes/lego_mini.yml'])"
     launcher = {"OMPI_COMM_WORLD_RANK": "0", "OMPI_COMM_WORLD_SIZE": "2"}
     result = run_python(code, **launcher)
     assert result.returncode == 2

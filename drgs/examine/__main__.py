@@ -1,0 +1,71 @@
+"""``drgs examine FOLDER``: which effects photographs call for, and the evidence.
+
+Runs :func:`drgs.examine.examination.examine`, as ``drgs fit FOLDER`` does at its start.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Sequence
+
+from drgs.cli.commands import CommandParser, file_or_folder, run_command
+from drgs.cli.execution import add_execution_arguments, execution_settings, select_variant
+from drgs.config.load import load_config
+from drgs.config.section import format_value
+from drgs.core.environment import VARIANTS
+from drgs.datasets import load_dataset
+from drgs.datasets.folders import config_for
+from drgs.examine.examination import examine, show_progress
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of ``python -m drgs.examine``."""
+    run_command(add_arguments, "python -m drgs.examine", arguments)
+
+
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Find out which effects photographs call for, by short fits that leave some of them out. "
+        "Writes nothing. `drgs fit FOLDER` begins with the same."
+    )
+    parser.show_examples("%(prog)s photographs")
+    parser.add_argument(
+        "config",
+        type=file_or_folder,
+        metavar="FOLDER|CONFIG.yml",
+        help="dataset folder, or configuration file, whose own values are not examined",
+    )
+    parser.add_overrides("value of the configuration, which is then not examined")
+    add_execution_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Examine the dataset, and print the table and the command that fits with the choice."""
+    if args.config.is_dir():
+        config, _ = config_for(args.config, args.overrides)
+    else:
+        config = load_config(args.config, args.overrides)
+    with execution_settings(args.threads, args.debug):
+        dataset = load_dataset(config.data_for_training, sections=config.extensions)
+        print(dataset.description)
+        select_variant(args.variant or VARIANTS[0])
+        with show_progress() as progress:
+            examination = examine(dataset, config, progress)
+    print(examination)
+    if changes := examination.changes:
+        words = ["drgs", "fit", str(args.config)]
+        chosen = (f"{key}={_yaml_of(value)}" for key, value in changes.items())
+        for each in (*args.overrides, *chosen):
+            words += ["--set", each]
+        print(f"fit with it: {shlex.join(words)}")
+
+
+def _yaml_of(value: object) -> str:
+    return format_value(list(value) if isinstance(value, tuple) else value)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,233 @@
+"""``python -m drgs.fit CONFIG.yml|FOLDER``: fit Gaussians to photographs.
+
+Runs :class:`drgs.fit.session.FitSession` with a given or a default configuration.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drgs.cli.commands import MAX_PORT, CommandParser, bounded_int, file_or_folder, run_command
+from drgs.cli.ending import INTERRUPTED_STATUS
+from drgs.cli.execution import add_execution_arguments, execution_settings
+from drgs.config.extensions import describe_extensions
+from drgs.config.load import load_config
+from drgs.config.schema import FitConfig
+from drgs.core.environment import require_module
+from drgs.core.errors import UserError
+from drgs.core.processes import process_number, start_mpi
+from drgs.datasets.folders import config_for
+from drgs.fit.budget import Budget, parse_duration
+from drgs.fit.fit_folder import FitFolder
+from drgs.fit.session import FitSession
+from drgs.results.files import CONFIG, EVENTS
+from drgs.results.folder import load_moved_config
+from drgs.training.parallel.communicator import Communicator
+
+if TYPE_CHECKING:  # imported with --view
+    from drgs.live_page.server import LocalServer
+
+MIN_EXAMINED_SECONDS = 100  # of a --budget: an examination takes 8 to 25 s
+
+LOADING_SECONDS = 1.2  # before run(), for imports; --budget includes them
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of ``python -m drgs.fit``."""
+    run_command(add_arguments, "python -m drgs.fit", arguments)
+
+
+def add_arguments(parser: CommandParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = "Fit 3D Gaussians to posed photographs."
+    parser.show_examples(
+        "%(prog)s photographs",
+        "%(prog)s scenes/photos.yml --data DIR --out out/mine",
+        "%(prog)s --resume out/mine",
+    )
+    parser.set_help_footer(describe_extensions)
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        "config",
+        nargs="?",
+        type=file_or_folder,
+        metavar="CONFIG.yml|FOLDER",
+        help="configuration file, or dataset folder, whose settings are then chosen automatically",
+    )
+    what.add_argument(
+        "--resume", type=file_or_folder, metavar="OUT_DIR", help="continue a fit that was stopped"
+    )
+    parser.add_argument(
+        "--data", metavar="DIR", help="dataset folder (data.path), also if it was moved"
+    )
+    parser.add_argument("--out", metavar="DIR", help="output folder (default: out/NAME)")
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace an earlier run in the output folder"
+    )
+    parser.add_overrides("override a value of the configuration, as in densify.every=200")
+    parser.add_argument(
+        "--leave-out",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="photograph that is not used (data.leave_out), by its file name; repeatable",
+    )
+    parser.add_argument(
+        "--budget",
+        type=parse_duration,
+        metavar="TIME",
+        help="90s, 5m, 1h30m: plan a fit that ends within this time, results included",
+    )
+    _add_viewing(parser)
+    add_execution_arguments(parser)
+    parser.set_defaults(run=run, is_shared=True, prog=parser.prog)
+
+
+def _add_viewing(parser: CommandParser) -> None:
+    group = parser.add_argument_group("viewing", "These do not change the result.")
+    group.add_argument(
+        "--view",
+        action="store_true",
+        help="show the running fit on a web page, with buttons to pause and end it (extra: viewer)",
+    )
+    group.add_argument(
+        "--view-address",
+        metavar="ADDRESS",
+        help="address of the page (default: 127.0.0.1, reachable from this machine only)",
+    )
+    group.add_argument(
+        "--view-port",
+        type=bounded_int(1, MAX_PORT),
+        metavar="N",
+        help="port of the page (default: first free port from 8080)",
+    )
+    group.add_argument(
+        "--tensorboard",
+        action="store_true",
+        help="also write the history for TensorBoard (extra: tensorboard)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Fit the dataset of the command line; exit with status 130 if Ctrl-C stopped it."""
+    started = time.perf_counter() - LOADING_SECONDS
+    comm = communicator(args)
+    budget = None if args.budget is None else Budget(args.budget, started + args.budget)
+    with execution_settings(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
+        session = FitSession(
+            None, variant=args.variant, budget=budget, check_ranges=check_ranges, comm=comm
+        )
+        if not comm.is_root:
+            session.run()
+            return
+        server = blocks.enter_context(page_server(args))
+        if args.tensorboard:
+            require_module("tensorboardX", "tensorboard", "--tensorboard")
+        session.config, out = read_inputs(args)
+        session.folder = FitFolder(out, args.command, args.resume is not None, args.overwrite)
+        if args.config is not None and args.config.is_dir():
+            choose_effects(session, session.config, session.folder)
+        session.uses_terminal = True
+        session.on_start = partial(add_observers, args, server, blocks)
+        finished = session.run()
+    if not finished:
+        print(f"stopped; continue with: {args.prog} --resume {out}")
+        sys.exit(INTERRUPTED_STATUS)
+
+
+def choose_effects(session: FitSession, config: FitConfig, folder: FitFolder) -> None:
+    """Let the session examine the dataset, unless an earlier run in its folder has."""
+    examined = folder.with_examination(config)
+    if examined is not None:
+        session.config = examined
+    elif session.budget is not None and session.budget.seconds < MIN_EXAMINED_SECONDS:
+        print(f"not examined: --budget is less than {MIN_EXAMINED_SECONDS} s")
+    else:
+        session.examines = True
+
+
+def communicator(args: argparse.Namespace) -> Communicator:
+    """Return the communicator of this process, or of those that ``mpiexec`` has started."""
+    if process_number() is None:
+        return Communicator()
+    start_mpi()
+    comm = Communicator.world()
+    if args.threads is None:
+        args.threads = comm.num_own_cores
+    if args.view:
+        raise UserError("--view: shows the fit of one process alone; leave it out, or mpiexec")
+    if not comm.is_root:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # rank 0 decides when to stop
+    return comm
+
+
+def add_observers(
+    args: argparse.Namespace, server: LocalServer | None, blocks: ExitStack, session: FitSession
+) -> None:
+    """Add observers for TensorBoard and the server's page; blocks: closed with the command."""
+    if args.tensorboard:
+        from drgs.fit.event_log import EventLog
+
+        assert session.folder is not None, "the command has an output folder"
+        log = EventLog(session.folder.path / EVENTS, session.history)
+        session.observers.append(blocks.enter_context(closing(log)))
+    if server is not None:
+        from drgs.fit.live_view import watch
+        from drgs.live_page.server import url
+
+        trainer = session.trainer
+        viewer, session.criterion = watch(server, trainer, trainer.dataset, session.criterion)
+        session.observers.append(viewer)
+        print(f"look on at {url(server)}", flush=True)
+
+
+def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer | None]:
+    """Return the server of ``--view``'s page; None without it."""
+    if not args.view:
+        for name in ("address", "port"):
+            if getattr(args, f"view_{name}") is not None:
+                raise UserError(f"--view-{name}: needs --view")
+        return nullcontext()
+    require_module("viser", "viewer", "--view")
+    from drgs.live_page.server import ADDRESS, run_server
+
+    options = ("--view-address", "--view-port")
+    return run_server(args.view_address or ADDRESS, args.view_port, options)
+
+
+def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:
+    """Return the configuration that the command line specifies, and the output folder."""
+    data = [] if args.data is None else [f"data.path={args.data}"]
+    if args.resume is not None:
+        given = args.out is not None, args.budget is not None, args.overwrite, args.leave_out
+        if args.overrides or any(given):
+            raise UserError(
+                f"--resume: takes its configuration from {args.resume / CONFIG}: leave out --out, "
+                "--set, --leave-out, --budget and --overwrite"
+            )
+        return load_moved_config(args.resume, data), args.resume
+    out = [] if args.out is None else [f"output.dir={args.out}"]
+    left_out = [f"data.leave_out={json.dumps(args.leave_out)}"] if args.leave_out else []
+    overrides = args.overrides + left_out + data + out
+    if args.config.is_dir():
+        if data:
+            raise UserError(f"--data: {args.config} is a folder already; leave one of them out")
+        config, reasons = config_for(args.config, overrides)
+        print(reasons)
+        name = args.config.resolve().name
+    else:
+        config, name = load_config(args.config, overrides), args.config.stem
+    return config, config.output.dir or Path("out") / name
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,244 @@
+"""The output folder of a fit: a checkpoint is read before the fit, results are written after it."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import drjit as dr
+import mitsuba as mi
+
+from drgs.config.approximations import Approximations
+from drgs.config.changes import with_changes
+from drgs.config.schema import FitConfig
+from drgs.core.environment import processor
+from drgs.core.errors import UserError
+from drgs.core.files import atomic_path
+from drgs.core.folders import sole_writer
+from drgs.datasets.types import Dataset, evenly_spaced
+from drgs.examine.examination import Examination, given_keys
+from drgs.fit.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
+from drgs.fit.inputs import versions
+from drgs.fit.loop import History
+from drgs.fit.report import MAX_PICTURES, FitImages, write_images, write_results
+from drgs.gaussians.parameters import Gaussians
+from drgs.results import files, folder
+from drgs.results.history import write_density, write_history
+from drgs.results.html_viewer import DisplaySettings, shows_as_fitted
+from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
+from drgs.results.refined_cameras import write_views
+from drgs.training.trainer import Trainer
+
+if TYPE_CHECKING:  # imported where it is needed
+    from drgs.fit.viewers_fit import ForViewers
+
+
+@dataclass(eq=False)
+class FitFolder:
+    """The output folder of one fit, which the session alone writes to."""
+
+    path: Path
+    command: str = ""  # the line that was typed, for the report
+    resumes: bool = False  # a fit that was stopped, whatever its configuration
+    overwrites: bool = False  # the run that the folder holds
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep other commands from writing to the folder, from when it exists."""
+        with sole_writer(self.path) as self._keep:
+            yield
+
+    def is_finished(self, config: FitConfig) -> bool:
+        """Return whether the folder holds all results of the fit already."""
+        if self.overwrites:
+            return False
+        if self.resumes:
+            return folder.has_results(self.path)
+        return folder.is_finished(self.path, config)
+
+    def checkpoint_for(self, config: FitConfig, has_budget: bool) -> Checkpoint | None:
+        """Return the checkpoint to continue from, if there is one.
+
+        Raises ``UserError`` where the folder belongs to another fit. Nothing is written.
+        """
+        if self.overwrites:
+            return None
+        if has_budget:
+            folder.require_no_run(self.path)
+        elif not self.resumes:
+            folder.check_output_folder(self.path, config)
+        return load_checkpoint(self.path, config)
+
+    def claim(self, config: FitConfig, dataset: Dataset) -> None:
+        """Make the folder the fit's, or raise ``UserError`` and leave it unchanged."""
+        self._keep()
+        images = folder.image_names(dataset.test_split, [view.name for view in dataset.test])
+        if self.overwrites:
+            folder.remove_run(self.path, images)
+        if self.resumes:
+            folder.continue_run(self.path, config, images)
+        else:
+            folder.claim_output_folder(self.path, config, images)
+
+    def write_plan(self, text: str) -> None:
+        """Write the plan and its reasons."""
+        with atomic_path(self.path / files.BUDGET_PLAN) as temporary:
+            temporary.write_text(text)
+
+    def write_examination(self, examination: Examination) -> None:
+        """Write what was chosen, and why."""
+        with atomic_path(self.path / files.EXAMINATION) as temporary:
+            temporary.write_text(examination.to_json())
+
+    def with_examination(self, config: FitConfig) -> FitConfig | None:
+        """Return the configuration with what an examination chose for the run in the folder.
+
+        None: there is no such run. Given values stay.
+        """
+        path = self.path / files.EXAMINATION
+        if self.overwrites or not path.is_file():
+            return None
+        try:
+            changes, given = dict(json.loads(path.read_text())["changes"]), given_keys(config)
+            changed = with_changes(config, {k: changes[k] for k in changes.keys() - given})
+        except (ValueError, KeyError, TypeError):
+            raise UserError(
+                f"{path}: must be what an examination wrote, got something else; examine again "
+                "with --overwrite, or choose another folder with --out"
+            ) from None
+        return changed if folder.is_run_of(self.path, changed) else None
+
+    @property
+    def remedy(self) -> str:
+        """Advice after numbers that are not finite."""
+        has_checkpoint = (self.path / files.CHECKPOINT).exists()
+        kept = "the last checkpoint is kept" if has_checkpoint else "nothing was saved yet"
+        return (
+            f"{kept}. --resume {self.path} --debug repeats this with range checks; lower learning "
+            "rates (--set optimizer.means_lr=..., and so on) may avoid it"
+        )
+
+    def write_results(
+        self,
+        trainer: Trainer,
+        history: History,
+        gaussians: Gaussians,
+        for_viewers: ForViewers | None,
+        wall_s: float,
+    ) -> FitMetrics:
+        """Write the results of a finished fit, and measure them; return ``metrics.json``.
+
+        for_viewers: None if other viewers render as the fit does; wall_s: time of iterations.
+        """
+        out, config, dataset, render = self.path, trainer.config, trainer.dataset, trainer.images
+        saved_gaussians(gaussians, config).save(out / files.GAUSSIANS)
+        for effect in trainer.effects:
+            effect.write(out, dataset)
+        write_history(out / files.HISTORY, history.rows)
+        write_density(out / files.DENSITY, history.density)
+        write_views(out / files.VIEWS, dataset)
+        folder.write_run_config(out, config)
+        output, split = config.output, dataset.test_split
+        scores = write_images(out, dataset, render, output.save_renders, output.report)
+        test = SplitMetrics(**vars(mean_of(scores)), split=split)
+        metrics = self._metrics(config, gaussians.num_gaussians, wall_s, test)
+        other, approximations = None, config.model.approximations
+        if for_viewers is not None:
+            other = for_viewers.gaussians
+            other.save(out / files.GAUSSIANS_FOR_VIEWERS)
+            views = evenly_spaced(dataset.test, MAX_PICTURES)
+            images = zip(for_viewers.images(views), views, strict=True)
+            quality = mean_quality((image, view.image, view.mask) for image, view in images)
+            metrics["viewers"] = SplitMetrics(**vars(quality), split=split)
+        if output.report:
+            shown = gaussians_on_page(gaussians, approximations, other)
+            scene = trainer.full_scene()
+            assert scene is not None, "rank 0 writes the results"
+            fitted = FitImages(scene, gaussians, render, shown)
+            write_results(out, dataset, fitted, scores, history, metrics)
+        self.finish(metrics)
+        return metrics
+
+    def _metrics(
+        self, config: FitConfig, num_gaussians: int, wall_s: float, test: SplitMetrics
+    ) -> FitMetrics:
+        known = versions()
+        return {
+            "iterations": config.iterations,
+            "num_gaussians": num_gaussians,
+            "wall_s": round(wall_s, 2),
+            "test": test,
+            "seed": config.seed,
+            "versions": {
+                "drgs": known["drgs"],
+                "mitsuba": known["Mitsuba"],
+                "drjit": known["Dr.Jit"],
+                "numpy": known["numpy"],
+                "python": platform.python_version(),
+                "llvm": known["LLVM"],
+            },
+            "variant": mi.variant() or "",
+            "threads": dr.thread_count(),
+            "processor": processor(),
+            "date": datetime.now().astimezone().isoformat(timespec="minutes"),
+            "command": self.command,
+            "config": config.model_dump(mode="json"),
+        }
+
+    def describe(self, metrics: FitMetrics) -> str:
+        """Return the results in a few lines, and where they are."""
+        test, viewers = metrics["test"], metrics.get("viewers")
+        lines = [
+            f"{test['num_views']} {test['split']} views: PSNR {test['psnr']:.2f} dB, "
+            f"SSIM {test['ssim']:.4f}; {metrics['num_gaussians']:,} Gaussians; "
+            f"{metrics['iterations']} iterations in {metrics['wall_s']:.0f} s"
+        ]
+        if viewers is not None:
+            path = self.path / files.GAUSSIANS_FOR_VIEWERS
+            lines.append(f"as other viewers show {path}: PSNR {viewers['psnr']:.2f} dB")
+        lines.append(f"written: {self.path}")
+        if cast("dict[str, object]", metrics["config"]["output"])["report"]:
+            lines.append(f"open {self.path / files.REPORT}")
+        return "\n".join(lines)
+
+    def finish(self, metrics: FitMetrics | None = None) -> None:
+        """Write ``metrics.json`` (None: it exists), and end the run by removing the checkpoint."""
+        if metrics is not None:
+            with atomic_path(self.path / files.METRICS) as temporary:
+                temporary.write_text(json.dumps(metrics, indent=2) + "\n")
+        remove_checkpoint(self.path)
+        folder.seal_run(self.path)
+
+
+def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
+    """Return the Gaussians of ``point_cloud.ply`` from the trainer's.
+
+    Its header records approximations that are not the default. It has no smoothing filter with
+    ``output.bake_smoothing``.
+    """
+    others = config.model.approximations.non_default
+    gaussians = replace(gaussians, rendered_with=others or None)
+    return _remove_filter(gaussians) if config.output.bake_smoothing else gaussians
+
+
+def gaussians_on_page(
+    gaussians: Gaussians, approximations: Approximations, for_viewers: Gaussians | None
+) -> DisplaySettings:
+    """Return the Gaussians of ``viewer.html``: those for viewers if it cannot render the fit's."""
+    if for_viewers is not None and not shows_as_fitted(approximations):
+        return DisplaySettings(for_viewers, Approximations())
+    return DisplaySettings(_remove_filter(gaussians), approximations)
+
+
+def _remove_filter(gaussians: Gaussians) -> Gaussians:
+    if gaussians.smoothing is None:
+        return gaussians
+    from drgs.effects.smoothing import bake_smoothing
+
+    return bake_smoothing(gaussians)

@@ -1,0 +1,378 @@
+"""A fit from its configuration to its result: the program of ``drgs fit`` and ``drgs.train``.
+
+    configuration -> dataset -> initial Gaussians -> (plan) -> trainer -> iterations -> results
+
+:class:`drgs.fit.fit_folder.FitFolder` reads and writes files; without one nothing is written.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import mitsuba as mi
+from typing_extensions import override
+
+from drgs.cli.ending import StopRequest
+from drgs.cli.execution import select_variant
+from drgs.cli.progress import RunProgress
+from drgs.config.changes import with_changes
+from drgs.config.load import config_from, load_config
+from drgs.config.schema import FitConfig
+from drgs.core.environment import VARIANTS
+from drgs.core.errors import UserError, UserNote
+from drgs.core.memory import release_unused_memory
+from drgs.core.registry import reporting_extensions
+from drgs.datasets import Dataset, load_dataset
+from drgs.datasets.folders import config_for
+from drgs.examine.examination import Examination, examine, show_progress
+from drgs.fit.budget import Budget, Deadline, Plan, plan_fit, rehearse
+from drgs.fit.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
+from drgs.fit.fingerprint import Fingerprint, fingerprint_of
+from drgs.fit.fit_folder import FitFolder, saved_gaussians
+from drgs.fit.inputs import share_gaussians, share_inputs
+from drgs.fit.loop import (
+    HeldOutQuality,
+    History,
+    Iteration,
+    Observer,
+    RootDecides,
+    StopCriterion,
+    iterations,
+    smoother,
+)
+from drgs.fit.memory import room_for_targets
+from drgs.fit.summary import summary_of_fit
+from drgs.gaussians.parameters import Gaussians
+from drgs.initialization.defaults import resolve_defaults
+from drgs.initialization.start import description_of_start, gaussians_at, start_of
+from drgs.integrator.scene import check_lenses
+from drgs.integrator.summary import format_effects
+from drgs.results.history import HistoryRow
+from drgs.training.density.strategy import DensityStrategy
+from drgs.training.effects.base import TrainingEffect
+from drgs.training.finite_checks import NonFiniteError
+from drgs.training.losses import Loss
+from drgs.training.parallel.communicator import Communicator
+from drgs.training.trainer import StepReport, Trainer
+
+if TYPE_CHECKING:  # imported where it is needed
+    from drgs.fit.viewers_fit import ForViewers
+
+
+class ProgressLine(Observer):
+    """Draws the progress of a fit: see :class:`drgs.fit.loop.Observer`."""
+
+    def __init__(self, progress: RunProgress, criterion: StopCriterion) -> None:
+        self._progress, self._criterion = progress, criterion
+        self._psnr: float | None = None  # dB, smooth
+
+    @override
+    def after_iteration(
+        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
+    ) -> None:
+        if (row := done.row) is not None:
+            self._psnr = smoother(self._psnr, row.psnr)
+            status = f"loss {row.loss:.4f}  PSNR {self._psnr:5.2f} dB  "
+            status += f"Gaussians {row.num_gaussians:,}"
+            self._progress.update(row.iteration, self._criterion.num_iterations(trainer), status)
+
+
+@dataclass(eq=False)
+class FitSession:
+    """A fit, by one process or several, which all run the same session.
+
+    Rank 0 alone has a configuration, a folder and a terminal, and decides when to stop.
+    """
+
+    config: FitConfig | None
+    dataset: Dataset | None = None  # None: the configured one
+    folder: FitFolder | None = None  # for results and checkpoints
+    uses_terminal: bool = False  # prints, draws progress, and takes Ctrl-C as a request to stop
+    variant: str | None = None  # of Mitsuba; None: the active one
+    budget: Budget | None = None  # the time for which the fit is planned
+    check_ranges: Callable[[], None] = lambda: None  # called after each iteration
+    on_start: Callable[[FitSession], None] = lambda session: None  # before the first iteration
+    comm: Communicator = field(default_factory=Communicator)
+    strategy: DensityStrategy | None = None  # None: the configured one
+    effects: Sequence[TrainingEffect] = ()  # besides the configured ones
+    loss: Loss | None = None  # None: the configured one
+    examines: bool = False  # whether an examination of the dataset chooses effects
+    examination: Examination | None = field(init=False, default=None)
+    trainer: Trainer = field(init=False)
+    history: History = field(init=False)
+    criterion: StopCriterion = field(init=False, default_factory=StopCriterion)
+    observers: list[Observer] = field(init=False, default_factory=list)
+    _fingerprint: Fingerprint | None = field(init=False, default=None)
+
+    @property
+    def _objects(self) -> tuple[DensityStrategy | None, Sequence[TrainingEffect], Loss | None]:
+        return self.strategy, self.effects, self.loss
+
+    @property
+    def _inputs(self) -> tuple[FitConfig, Dataset]:
+        assert self.config is not None and self.dataset is not None, "they are loaded"
+        return self.config, self.dataset
+
+    def _print(self, text: str) -> None:
+        if self.uses_terminal:
+            print(text)
+
+    def run(self) -> bool:
+        """Fit, and write the results; False if Ctrl-C stopped the fit, with its state saved."""
+        folder = self.folder
+        with nullcontext() if folder is None else folder.lock():
+            if self._is_finished():
+                return True
+            plan = self.prepare()
+            if folder is not None:
+                folder.claim(*self._inputs)
+                if self.examination is not None:
+                    folder.write_examination(self.examination)
+            if plan is not None:
+                self.criterion = Deadline(self.trainer, plan.end, plan.chosen.curve)
+                if folder is not None and self.budget is not None:
+                    folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
+            self.on_start(self)
+            try:
+                if not self.iterate():
+                    return False
+                self._finish()
+            except NonFiniteError as error:
+                remedy = "" if folder is None else f"; {folder.remedy}"
+                raise UserError(f"{error}{remedy}") from None
+        return True
+
+    def _is_finished(self) -> bool:
+        finished, folder = False, self.folder
+        if folder is not None and self.config is not None:
+            finished = folder.is_finished(self.config)
+            if finished:
+                folder.finish()  # a process that was killed after its last file has not
+                self._print(f"{folder.path}: this fit is finished; --overwrite does it again")
+        return bool(self.comm.broadcast_numbers(finished))
+
+    def prepare(self) -> Plan | None:
+        """Load the data, initialize the Gaussians, make the trainer; return the plan, if any.
+
+        Raises ``UserError`` for input that cannot be used. Nothing is written.
+        """
+        comm, checkpoint, gaussians, plan = self.comm, None, None, None
+        given = self.config
+        if comm.is_root:
+            checkpoint = self._load()
+        if self.variant is not None or mi.variant() is None:
+            select_variant(self.variant or VARIANTS[0])
+        if comm.is_root:
+            if self.examines and given is not None and checkpoint is None:
+                self._examine(given)
+            gaussians = self._initial_gaussians()
+        gaussians = share_gaussians(comm, gaussians)
+        if self.budget is not None:
+            plan = self._plan(gaussians, self.budget)
+        self.config, self.dataset = share_inputs(comm, self.config, self.dataset)
+        room = partial(room_for_targets, self.config, self.dataset, gaussians, comm)
+        self.trainer = Trainer(
+            self.config, self.dataset, gaussians, comm, *self._objects, room=room
+        )
+        self.history = History()  # starts its clock
+        if comm.broadcast_numbers(checkpoint is not None):
+            self._restore(checkpoint)
+        return plan
+
+    def _load(self) -> Checkpoint | None:
+        """Load the dataset and complete the configuration; return the checkpoint, if any."""
+        folder, config, checkpoint = self.folder, self.config, None
+        assert config is not None, "rank 0 has one"
+        if folder is not None:
+            checkpoint = folder.checkpoint_for(config, self.budget is not None)
+        if checkpoint is not None and checkpoint.config is not None:
+            config = checkpoint.config
+        if self.dataset is None:
+            self.dataset = load_dataset(config.data_for_training, sections=config.extensions)
+        if folder is not None:
+            self._fingerprint = fingerprint_of(self.dataset)
+            if checkpoint is not None:
+                now = self._fingerprint
+                check_same_data(folder.path, config.data.path, checkpoint.data, now)
+        self.config = resolve_defaults(config, self.dataset)
+        return checkpoint
+
+    def _examine(self, given: FitConfig) -> None:
+        """Choose the effects that the photographs call for; given: not completed."""
+        _, dataset = self._inputs
+        with show_progress() if self.uses_terminal else nullcontext() as progress:
+            self.examination = examine(dataset, given, progress)
+        self._print(str(self.examination))
+        changes = self.examination.changes
+        if changes:
+            given = with_changes(given, changes)
+        if "data.background" in changes:
+            self.dataset = load_dataset(given.data_for_training, sections=given.extensions)
+        self.config = resolve_defaults(given, self._inputs[1])
+
+    def _plan(self, gaussians: Gaussians, budget: Budget) -> Plan | None:
+        """Plan the fit, and make the plan its configuration; None on other ranks than 0."""
+        start = self.config, self.dataset, gaussians, self.comm
+        trainer, iteration_s = rehearse(*start, *self._objects)
+        scene = trainer.full_scene()  # gathered from all ranks
+        if scene is None:
+            return None
+        plan = plan_fit(*self._inputs, gaussians, budget.end, scene, iteration_s)
+        self.config = plan.config
+        self._print(plan.reasons)
+        return plan
+
+    def _initial_gaussians(self) -> Gaussians:
+        """Print data, start and simulated effects; return the initial Gaussians.
+
+        Raises ``UserError`` for lenses that the projection cannot render.
+        """
+        config, dataset = self._inputs
+        self._print(dataset.description)
+        self._print(
+            f"{len(dataset.train)} views to train on, {len(dataset.test)} of split "
+            f"'{dataset.test_split}' to measure on; background {config.data.background}; "
+            f"scene extent {dataset.extent:.3g}"
+        )
+        start = start_of(config, dataset)
+        self._print(description_of_start(config, start))
+        reasons = {} if self.examination is None else self.examination.reasons
+        self._print(format_effects(summary_of_fit(config, dataset, reasons)))
+        views, remedy = (*dataset.train, *dataset.test), "set data.ignore_distortion"
+        check_lenses(config.model, views, f"{config.data.path}: ", remedy)
+        return gaussians_at(start, config)
+
+    def _restore(self, checkpoint: Checkpoint | None) -> None:
+        """Continue from the checkpoint of rank 0."""
+        start, state = self.trainer.state(), {}
+        if checkpoint is not None and self.folder is not None:
+            check_fits(self.folder.path, checkpoint, start)
+            past = checkpoint.history, checkpoint.density, checkpoint.wall_s
+            state, self.history = checkpoint.trainer, History.from_arrays(*past)
+        self.trainer.restore(state)
+        self._print(f"continues at iteration {self.trainer.iteration}")
+
+    def iterate(self) -> bool:
+        """Run the iterations that are left, with checkpoints; False if Ctrl-C stopped them.
+
+        The state is saved then, and after the last iteration, before results are written.
+        """
+        trainer, comm = self.trainer, self.comm
+        criterion, stop = RootDecides(self.criterion, comm), StopRequest()
+        with ExitStack() as blocks:
+            observers: list[Observer] = [HeldOutQuality(trainer.dataset.test), *self.observers]
+            if self.uses_terminal:
+                total = criterion.num_iterations(trainer)
+                progress = RunProgress("iteration", total, trainer.iteration)
+                observers.insert(0, ProgressLine(blocks.enter_context(progress), criterion))
+                blocks.enter_context(stop)
+            for done in iterations(trainer, self.history, criterion):
+                self.check_ranges()
+                for observer in observers:
+                    observer.after_iteration(trainer, self.history, done, lambda: stop.requested)
+                stops = bool(comm.broadcast_numbers(stop.requested))
+                every = trainer.config.output.checkpoint_every
+                is_due = every is not None and (done.is_last or done.report.passes(every))
+                if stops or is_due:
+                    self._save_checkpoint()
+                if stops:
+                    return False
+        return True
+
+    def _save_checkpoint(self) -> None:
+        state, history = self.trainer.state(), self.history
+        if self.folder is not None and self._fingerprint is not None:
+            past = *history.arrays(), history.wall_s
+            checkpoint = Checkpoint(state, *past, self._fingerprint)
+            save_checkpoint(self.folder.path, self.trainer.config, checkpoint)
+
+    def _finish(self) -> None:
+        """Fit the file for other viewers, if one is needed; measure and write the results."""
+        trainer, wall_s = self.trainer, self.history.wall_s
+        gaussians, wanted = trainer.gaussians(), trainer.config.densify.prune.to
+        if self.comm.is_root and wanted is not None and trainer.num_gaussians > wanted:
+            note = (
+                f"time was up before there were only densify.prune.to = {wanted:,} Gaussians: "
+                f"there are {trainer.num_gaussians:,}; give --budget more time"
+            )
+            warnings.warn(UserNote(note), stacklevel=2)
+        release_unused_memory()  # encoding the orbit's frames takes as much as iterations do
+        trainer.full_scene()  # gathered from all ranks
+        for_viewers = None
+        if not trainer.config.model.approximations.is_default:
+            for_viewers = self._fit_for_viewers(gaussians)
+        if self.folder is not None:
+            metrics = self.folder.write_results(
+                trainer, self.history, gaussians, for_viewers, wall_s
+            )
+            self._print(self.folder.describe(metrics))
+
+    def _fit_for_viewers(self, gaussians: Gaussians) -> ForViewers:
+        """Return Gaussians for other viewers; the trainer is released, and renders the fit's."""
+        from drgs.fit.viewers_fit import for_viewers, num_iterations
+
+        if not self.uses_terminal:
+            return for_viewers(self.trainer, gaussians)
+        total = num_iterations(self.trainer.config)
+        with RunProgress("iteration for viewers", total) as shown:
+            return for_viewers(self.trainer, gaussians, lambda done: shown.update(done, total))
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """The result of a fit in memory."""
+
+    gaussians: Gaussians  # numpy arrays, as in the command's ``point_cloud.ply``
+    history: tuple[HistoryRow, ...]  # as in ``history.csv``
+    trainer: Trainer  # ``step()`` continues the fit, ``images(views)`` renders
+
+
+def train(
+    config: FitConfig | Mapping[str, object] | str | Path,
+    dataset: Dataset | None = None,
+    callback: Callable[[StepReport], bool | None] | None = None,
+    *,
+    strategy: DensityStrategy | None = None,
+    effects: Sequence[TrainingEffect] = (),
+    loss: Loss | None = None,
+) -> FitResult:
+    """Fit Gaussians to photographs, in memory: the bytes that ``drgs fit`` writes to its PLY file.
+
+    config: the path of a YAML file, or of a dataset's folder (``drgs.datasets.folders`` chooses the
+    configuration, and :func:`drgs.examine` the effects if the folder is all that is given); nested
+    mappings, or a :class:`drgs.config.schema.FitConfig`. dataset: the photographs and their
+    background, by default those of the section ``data``. callback: called after each iteration with
+    its :class:`drgs.training.trainer.StepReport`; the fit ends early where it returns True.
+
+    strategy: changes the population, instead of ``densify.strategy``; effects: take part in the fit
+    besides those of the configuration; loss: of an image and its photograph, instead of ``loss``.
+
+    Activates the Mitsuba variant ``llvm_ad_rgb`` where none is active. Nothing is written.
+
+    Raises ``drgs.core.errors.UserError`` (a ValueError) for wrong input, naming the key and the
+    remedy, and ``drgs.training.finite_checks.NonFiniteError`` if a number is not finite.
+    """
+    is_folder = False
+    if isinstance(config, (str, Path)):
+        is_folder = Path(config).is_dir()
+        config = config_for(Path(config))[0] if is_folder else load_config(config)
+    elif not isinstance(config, FitConfig):
+        config = config_from(config, "train(): config")
+    is_examined = is_folder and dataset is None and not (strategy or effects or loss)
+    session = FitSession(
+        config, dataset, strategy=strategy, effects=effects, loss=loss, examines=is_examined
+    )
+    with reporting_extensions():
+        session.prepare()
+        trainer, history = session.trainer, session.history
+        for done in iterations(trainer, history, session.criterion):
+            if callback is not None and callback(done.report):
+                break
+    gaussians = saved_gaussians(trainer.gaussians(), trainer.config)
+    return FitResult(gaussians, tuple(history.rows), trainer)

@@ -1,0 +1,4 @@
+"""``drgs render``: images of Gaussians, of a fit, of a Mitsuba scene.
+
+May import everything but other commands.
+"""

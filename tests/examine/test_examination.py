@@ -1,0 +1,287 @@
+"""Effects chosen by evidence: what is found where it is known, and what a user sees of it."""
+
+import json
+import re
+from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from PIL import ExifTags, Image
+from scipy.spatial.transform import Rotation
+from support.commands import assert_ends_well, assert_refused
+from support.fit_command import assert_fit_refused, assert_fits, without_images
+from support.small_capture import blobs, make_dataset, photograph, write_dataset
+
+import drgs
+from drgs.config.extensions import EFFECTS
+from drgs.config.load import config_from
+from drgs.core.registry import temporary_registrations
+from drgs.examine import __main__ as command
+from drgs.examine.examination import Examination, decide, given_keys, overlaps, split_views
+from drgs.training.effects.base import TrainingEffect
+from drgs.training.findings import Finding, exposure_spread
+
+ITERATIONS = 1500  # of a fit: the fewest that are examined
+NAMES = ["background of one colour", "exposure and white balance", "camera refinement"]
+assert_examines = partial(assert_ends_well, command.main)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    """Photographs of blobs on grey, of which no effect is the cause."""
+    grey = (0.5, 0.5, 0.5)
+    given, scene = make_dataset(train=40, test=2), blobs()
+
+    def seen(view):
+        return replace(view, image=photograph(scene, view, grey).image.astype(np.float32))
+
+    train, test = (tuple(map(seen, views)) for views in (given.train, given.test))
+    return replace(given, train=train, test=test, background=grey)
+
+
+def config_of(**sections):
+    init = {"num_points": 60, "half_extent": 0.6}
+    return {"iterations": ITERATIONS, "init": init, **sections}
+
+
+def spoil(dataset, change):
+    rng = np.random.default_rng(1)
+    return replace(dataset, train=tuple(change(view, rng) for view in dataset.train))
+
+
+def darken(view, rng):
+    image = view.image * np.exp(rng.normal(0, 0.3) - 0.4)
+    return replace(view, image=image.astype(np.float32))
+
+
+def turn(view, rng):
+    pose = view.camera_to_world.copy()
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(rng.normal(0, 0.04, 3)).as_matrix()
+    return replace(view, camera_to_world=pose)
+
+
+CASES = {
+    "nothing": (lambda view, rng: view, {}),
+    "exposure": (darken, {"colors.lr": 0.02}),
+    "poses": (turn, {"cameras.optimise": True}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_what_photographs_call_for_is_chosen_and_nothing_else(dataset, case):
+    change, chosen = CASES[case]
+    found = drgs.examine(spoil(dataset, change), config_of())
+    assert found.changes == chosen, str(found)
+    assert [each.effect for each in found.decisions] == NAMES
+    assert found.num_held_out == 10
+    again = drgs.examine(spoil(dataset, change), config_of())
+    for one, other in zip(found.decisions, again.decisions, strict=True):
+        assert replace(one, cost=None) == replace(other, cost=None)
+
+
+@pytest.mark.slow
+def test_a_background_of_one_colour_is_found(dataset):
+    black = replace(dataset, background=(0.0, 0.0, 0.0))
+    found = drgs.examine(black, config_of())
+    assert found.changes.keys() == {"data.background"}
+    np.testing.assert_allclose(found.changes["data.background"], 0.5, atol=0.01)
+    assert re.search(
+        r"background of one colour +\d+% of each border has one colour, mostly 0\.50", str(found)
+    )
+
+
+@pytest.mark.slow
+def test_given_values_are_not_examined_and_effects_from_outside_are(dataset):
+    with temporary_registrations():
+
+        @EFFECTS.register("mine")
+        class Mine(TrainingEffect):
+            """Changes nothing."""
+
+            name = "mine"
+
+            @classmethod
+            def look_for(cls, fit):
+                assert len(fit.images) == len(fit.dataset.test) == len(fit.alignments)
+                return Finding("mine", "to be tried", True, {"extensions.mine": None})
+
+        given = {"colors": {"lr": 0.02}, "cameras": {"optimise": False}}
+        found = drgs.examine(dataset, config_of(**given))
+        background, mine = sorted(found.decisions, key=lambda each: each.effect)
+        assert (background.effect, background.gain) == (NAMES[0], None)
+        assert (mine.effect, mine.gain, mine.chosen) == ("mine", 0.0, False)
+        found = drgs.examine(dataset, config_of(**given, extensions={"mine": None}))
+        assert [each.effect for each in found.decisions] == NAMES[:1]
+
+
+@pytest.mark.parametrize(
+    ("train", "iterations", "note"),
+    [
+        (1, 4000, "1 training photographs are fewer than 20"),
+        (2, 4000, "2 training photographs are fewer than 20"),
+        (40, 1400, "1400 iterations are fewer than 1500"),
+    ],
+)
+def test_too_little_is_not_examined(train, iterations, note):
+    found = drgs.examine(make_dataset(train), {"iterations": iterations})
+    assert (found.decisions, found.changes, found.note) == ((), {}, note)
+    assert str(found) == f"not examined: {note}"
+
+
+@pytest.mark.parametrize(
+    ("values", "key", "is_given"),
+    [
+        ({"colors": {"lr": None}}, "colors.lr", True),
+        ({"cameras": {"optimise": False}}, "cameras.optimise", True),
+        ({"data": {"background": None}}, "data.background", False),
+        ({"data": {"background": "white"}}, "data.background", True),
+        ({}, "colors.lr", False),
+        ({"coarse": []}, "coarse", True),
+        ({"densify": {"mcmc": {"gaussians": 500}}}, "densify.mcmc.gaussians", True),
+    ],
+)
+def test_keys_that_are_given(values, key, is_given):
+    data = {"path": ".", **values.get("data", {})}
+    assert (key in given_keys(config_from({**values, "data": data}, "x"))) is is_given
+
+
+def test_keys_overlap_with_their_sections():
+    assert overlaps("extensions.mine", "extensions.mine.rate")
+    assert overlaps("extensions.mine.rate", "extensions.mine") and overlaps("a.b", "a.b")
+    assert not overlaps("colors.lr", "colors.lr_decay")
+
+
+def test_large_photographs_are_scaled_and_masked_ones_not_held_out():
+    given = make_dataset(40)
+    large = [
+        replace(view, width=640, height=480, image=np.zeros((480, 640, 3), np.float32))
+        for view in given.train
+    ]
+    large[2] = replace(large[2], mask=np.zeros((480, 640), np.float32))
+    split, factor = split_views(replace(given, train=tuple(large)))
+    assert (factor, split.train[0].width, len(split.test), len(split.train)) == (5, 128, 9, 30)
+    assert all(view.mask is None for view in split.test)
+
+
+def test_each_photograph_is_fitted_or_held_out():
+    given = make_dataset(100, 3)
+    split, factor = split_views(given)
+    held_out = [view.name for view in split.test]
+    assert factor == 1 and len(held_out) == 12 and len(split.train) == 88
+    assert {*held_out} | {view.name for view in split.train} == {v.name for v in given.train}
+
+
+@pytest.mark.parametrize(
+    ("gains", "chosen"),
+    [
+        ((0.3, 0.4, 0.3), True),
+        ((0.3, 0.4, 0.1), False),  # 3.0 standard errors: 4.3 are needed for three
+        ((0.3, -0.2, 0.1), False),
+        ((0.04, 0.041, 0.04), False),
+    ],
+)
+def test_a_gain_counts_if_it_exceeds_its_spread(gains, chosen):
+    before = SimpleNamespace(psnr=np.array([20.0, 25.0, 30.0]), wall_s=2.0)
+    after = SimpleNamespace(psnr=before.psnr + gains, wall_s=3.0)
+    decision = decide(Finding("x", "seen", True, {"colors.lr": 0.02}), before, after)
+    assert decision.chosen is chosen and decision.cost == 1.5
+    assert decision.gain == pytest.approx(np.mean(gains))
+    deviations = np.array(gains) - np.mean(gains)
+    assert decision.spread == pytest.approx(np.sqrt((deviations**2).sum() / 2 / 3))
+    examination = Examination((decision,), 3, 9.0)
+    assert examination.changes == ({"colors.lr": 0.02} if chosen else {})
+    assert json.loads(examination.to_json())["changes"] == examination.changes
+
+
+def write_photograph(path, time=None):
+    image, exif = Image.new("RGB", (4, 4)), Image.Exif()
+    if time is not None:
+        details = exif.get_ifd(ExifTags.IFD.Exif)
+        tags = ExifTags.Base
+        details |= {tags.ExposureTime: time, tags.FNumber: 2.0, tags.ISOSpeedRatings: 100}
+        exif.get_ifd(ExifTags.IFD.Exif).update(details)
+    image.save(path, exif=exif)
+    return path
+
+
+def test_exposures_of_exif_are_compared_if_all_photographs_have_one(tmp_path):
+    short, long = (write_photograph(tmp_path / f"{t}.jpg", t) for t in (0.01, 0.04))
+    assert exposure_spread([short, long]) == pytest.approx(1.0)  # 2 stops apart
+    assert exposure_spread([short, write_photograph(tmp_path / "none.jpg")]) is None
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"no photograph")
+    assert exposure_spread([broken]) is None and exposure_spread([]) is None
+
+
+# Commands
+
+
+@pytest.fixture
+def folder(dataset, tmp_path, monkeypatch):
+    """Opaque photographs of different exposure in ``data``."""
+    without_images(monkeypatch)
+    write_dataset(tmp_path / "data", spoil(dataset, darken), alpha=1.0)
+    return tmp_path
+
+
+SETTINGS = ("--set", f"iterations={ITERATIONS}", "--set", "init.half_extent=0.6")
+SETTINGS += ("--set", "init.num_points=60", "--set", "data.background=[0.5, 0.5, 0.5]")
+SETTINGS += ("--set", "model.antialiased=false")
+
+
+@pytest.mark.slow
+def test_a_fit_of_a_folder_chooses_says_why_and_asks_once(folder):
+    data, out = folder / "data", folder / "out"
+    text = assert_fits(data, "--out", out, *SETTINGS).stdout
+    assert re.search(
+        r"exposure and white balance +brightness differs by .* colors\.lr: 0\.02", text
+    )
+    why = r"\(colors\.lr: brightness differs by [\d.]+%, colours by [\d.]+%: \+[\d.]+ dB\)"
+    assert re.search(why, text), text
+    assert yaml.safe_load((out / "config.yml").read_text())["colors"]["lr"] == 0.02
+    assert json.loads((out / "examination.json").read_text())["changes"] == {"colors.lr": 0.02}
+    assert "is finished" in assert_fits(data, "--out", out, *SETTINGS).stdout
+    again = assert_fits(out / "config.yml", "--out", folder / "again").stdout
+    assert "examined" not in again
+    points = [(f / "point_cloud.ply").read_bytes() for f in (out, folder / "again")]
+    assert points[0] == points[1]
+    printed = assert_examines(data, *SETTINGS).stdout
+    assert re.search(r"examined in \d+ s, on 10 held-out views:", printed)
+    assert re.search(rf"fit with it: drgs fit {data} .* --set colors\.lr=0\.02\n", printed)
+    message = "already holds another run, "
+    other = (*SETTINGS, "--set", "colors.lr=0.05")
+    assert_fit_refused(data, "--out", out, *other, folder=folder, message=message)
+    (out / "examination.json").write_text("{}")
+    message = "examination.json: must be what an examination wrote"
+    assert_fit_refused(data, "--out", out, *SETTINGS, folder=folder, message=message)
+
+
+REFUSED = [
+    (["nowhere"], "nowhere"),
+    ([], "arguments are required"),
+    (["empty"], "neither transforms_train.json"),
+    (["data", "--set", "colors.lr=11"], "colors.lr must be <= 10, got 11"),
+    (["data", "--set", "colours.lr=1"], "unknown key colours"),
+    (["data", "--variant", "scalar_rgb"], "scalar_rgb"),
+    (["data", "--threads", "0"], "--threads"),
+    (["data", "more"], "unrecognized arguments: more"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), REFUSED)
+def test_refused_inputs_of_the_command(words, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    write_dataset(tmp_path / "data", make_dataset(2, 1))
+    assert_refused(command.main, *words, folder=tmp_path, message=message)
+
+
+def test_a_short_fit_of_a_folder_is_not_examined(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_dataset(tmp_path / "data", make_dataset(2, 1))
+    outcome = assert_examines("data")
+    assert "not examined: 2 training photographs are fewer than 20" in outcome.stdout

@@ -1,0 +1,97 @@
+"""Gaussians that are fitted further as viewers render them."""
+
+import numpy as np
+import pytest
+from support import small_fits as fits
+from support.small_capture import decibels
+from support.viewer_rendering import VIEWER_RENDERING
+
+from drgs.config.changes import with_changes
+from drgs.config.schema import ModelConfig
+from drgs.core.errors import UserNote
+from drgs.fit import viewers_fit as viewers
+from drgs.fit.viewers_fit import for_viewers, num_iterations, tuning
+from drgs.integrator.scene import make_scene, render_views
+from drgs.training.trainer import Trainer
+
+NON_VIEWER_SETTINGS = {"model.antialiased": True, "model.low_pass": 0.02}
+
+
+def ended_fit(iterations=20, **changes):
+    """A trainer that has done all of its iterations, its dataset, and its Gaussians."""
+    dataset = fits.plain_dataset()
+    config = with_changes(fits.config_of(iterations=iterations), {**NON_VIEWER_SETTINGS, **changes})
+    trainer = fits.steps(Trainer(config, dataset, fits.disturbed_blobs()), iterations)
+    return trainer, dataset, trainer.gaussians()
+
+
+def psnr(images, dataset):
+    pairs = zip(images, dataset.test, strict=True)
+    return np.mean([decibels(image, view.image) for image, view in pairs])
+
+
+@pytest.mark.slow
+def test_iterations_improve_images_of_viewers(monkeypatch):
+    monkeypatch.setattr(viewers, "ITERATIONS_SHARE", 1.0)
+    trainer, dataset, gaussians = ended_fit()
+    before, counted = list(trainer.images(dataset.test)), []
+    found = for_viewers(trainer, gaussians, counted.append)
+    assert counted == list(range(1, 21))
+    model = ModelConfig(near=0.2, **VIEWER_RENDERING)
+
+    def in_viewers(gaussians):
+        scene = make_scene(gaussians, model, dataset.background)
+        return psnr(render_views(scene, dataset.test), dataset)
+
+    tuned = in_viewers(found.gaussians)
+    assert tuned > in_viewers(gaussians) + 0.2
+    assert psnr(found.images(dataset.test), dataset) == pytest.approx(tuned, abs=1e-6)
+    assert found.gaussians.rendered_with == {"antialiased": False, "low_pass": 0.3}
+    # The fit itself renders the same images as before.
+    np.testing.assert_array_equal(list(trainer.images(dataset.test)), before)
+
+
+def test_refined_cameras_and_colours_are_kept():
+    """Its rates are next to nothing; the views to measure are those of the refined cameras."""
+    changes = {"cameras.optimise": True, "cameras.rotation_lr": 1e-3, "colors.lr": 0.02}
+    changes["colors.vignetting_lr"] = 0.02
+    trainer, _, gaussians = ended_fit(8, **changes)
+    before = {effect.name: effect.values() for effect in trainer.effects}
+    tuners = []
+    found = for_viewers(trainer, gaussians, lambda done: tuners.append(done))
+    assert len(tuners) == num_iterations(trainer.config) == 1
+    for effect in found.effects:
+        for name, values in effect.values().items():
+            np.testing.assert_array_equal(values, before[effect.name][name])
+    config = tuning(trainer.config)
+    assert config.colors.lr == config.colors.vignetting_lr == viewers.NEGLIGIBLE_RATE
+    assert config.cameras.rotation_lr == 0 and len(found.effects) == 3
+
+
+def test_nonfinite_values_fall_back_to_the_closed_form(monkeypatch):
+    trainer, _, gaussians = ended_fit(8)
+    expected = viewers._closed_form(trainer, gaussians)  # private: what no iteration has changed
+    monkeypatch.setitem(viewers.TOUCH_UP_RATES, "scales_lr", 10.0)
+    monkeypatch.setattr(viewers, "ITERATIONS_SHARE", 0.5)
+    step = Trainer.step
+
+    def step_and_break(self):
+        report = step(self)
+        self.optimizer["means"] = self.optimizer["means"] * np.nan
+        return report
+
+    monkeypatch.setattr(Trainer, "step", step_and_break)
+    with pytest.warns(UserNote, match="for viewers are not fitted any further"):
+        found = for_viewers(trainer, gaussians)
+    np.testing.assert_array_equal(found.gaussians.log_scales, expected.log_scales)
+
+
+def test_tuning_keeps_the_population_and_continues_the_schedule():
+    changes = {**NON_VIEWER_SETTINGS, "model.order": "pixel", "coarse": [{"until": 9, "factor": 2}]}
+    config = with_changes(fits.config_of(iterations=400), changes)
+    further = tuning(config)
+    assert further.iterations == 432 and further.densify.stop == 1 and further.coarse == []
+    assert further.optimizer.decay_from == 400 / 432
+    assert further.model.approximations.is_default and not config.model.approximations.is_default
+    assert further.model.sh_degree == config.model.sh_degree
+    assert further.loss == config.loss and further.data == config.data
