@@ -304,7 +304,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         with self._lock, dr.suspend_grad():
             if mode == dr.ADMode.Primal:
                 self.state.cache.sensor = sensor
-            self._gather(scene)
+            self._update(scene)
             yield ImageRender.prepare(self.state, scene, sensor, seed, spp)
             if mode != dr.ADMode.Primal:
                 sensor.film().clear()  # it may hold an attached block
@@ -334,7 +334,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
                     "splats: inside 'aov', derivatives with 'aovs' of this integrator are not "
                     "supported: leave them out, or render it alone"
                 )
-            self._gather(scene)
+            self._update(scene)
             channels = rays.channels(self.state, scene, sensor, sampler, active)
             red, green, blue, alpha, *aovs = channels
             return mi.Color3f(red, green, blue), active & (alpha > 0), aovs, None
@@ -343,11 +343,11 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Return one line per simulated effect with its reason, and the effects that are not."""
         from drgs.integrator.summary import summary_of_scene
 
-        self._gather(scene)
+        self._update(scene)
         return summary_of_scene(self.state, scene, sensors)
 
-    def _gather(self, scene: mi.Scene) -> None:
-        self.state.gather(scene)
+    def _update(self, scene: mi.Scene) -> None:
+        self.state.update_gaussians(scene)
         if self.state.shadows:
             from drgs.integrator.light.shadows import shade
 

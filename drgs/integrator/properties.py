@@ -41,7 +41,7 @@ from drgs.integrator.state import (
 )
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
-    from drgs.integrator.gathering import ShRotation
+    from drgs.integrator.parts import ShRotation
 
 
 def flag(default: bool) -> Declared:
@@ -286,7 +286,7 @@ def _sh_rotations(props: mi.Properties) -> dict[str, ShRotation]:
     if not names:
         return {}
     from drgs.gaussians.similarity import Similarity
-    from drgs.integrator.gathering import ShRotation
+    from drgs.integrator.parts import ShRotation
 
     sh_rotations = {}
     for name in names:

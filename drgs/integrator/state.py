@@ -25,9 +25,9 @@ from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:
-    from drgs.integrator.gathering import GatheredGaussians, Part, Placement, ShRotation
+    from drgs.integrator.parts import CombinedParts, Part, Placement, ShRotation
 else:
-    GatheredGaussians = ShRotation = Any
+    CombinedParts = ShRotation = Any
 
 T = TypeVar("T")
 
@@ -69,7 +69,7 @@ class RenderCache:
 
     kept: dict[str, Cached[Any]] = field(default_factory=dict)  # by name
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
-    gathered: GatheredGaussians | None = None  # None: the own Gaussians alone, unmoved
+    parts: CombinedParts | None = None  # None: the own Gaussians alone, unmoved
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
     instances: list[mi.Shape] = field(default_factory=list)  # of the last scene, checked
     sensor: mi.Sensor | None = None  # rendered last
@@ -108,7 +108,7 @@ class SplatObject:
 
     def check_to_world(self) -> None:
         """Update ``is_moved``; PluginError for a ``to_world`` that is no similarity."""
-        from drgs.integrator.gathering import similarity_of
+        from drgs.integrator.parts import similarity_of
 
         self.is_moved = not similarity_of(self.to_world.matrix, "splats: to_world").is_identity
 
@@ -159,8 +159,8 @@ class SplatsState:
         """Highest spherical harmonics degree that is evaluated."""
         if self.given_degree is not None:
             return self.given_degree
-        if self.cache.gathered is not None:
-            return self.cache.gathered.gaussians.sh_degree
+        if self.cache.parts is not None:
+            return self.cache.parts.gaussians.sh_degree
         return self.default_degree
 
     @sh_degree.setter
@@ -190,9 +190,9 @@ class SplatsState:
     @property
     def pipeline(self) -> rendering.Pipeline:
         """Stages that the settings select."""
-        gathered = self.cache.gathered
+        parts = self.cache.parts
         # A smoothing filter is differentiated where it scales with an object.
-        of_smoothing = gathered is not None and gathered.gaussians.smoothing is not None
+        of_smoothing = parts is not None and parts.gaussians.smoothing is not None
         kinds = tuple(self.aovs.values())
         settings = self.approximations, self.sh_degree, of_smoothing, kinds, self.projection
 
@@ -221,9 +221,9 @@ class SplatsState:
 
     def settings(self) -> dict[str, object]:
         """Return settings by name, without those that are off or at their default."""
-        gathered = self.cache.gathered
-        parts = [one.gaussians for one in self.objects.values()]
-        parts = parts if gathered is None else [gathered.gaussians]
+        parts = self.cache.parts
+        own = [one.gaussians for one in self.objects.values()]
+        rendered = own if parts is None else [parts.gaussians]
         lit = {name: getattr(self, name) for name in ("light", "radiance_scale")}
         others = {
             "objects": ", ".join(self.nested_objects),
@@ -235,7 +235,8 @@ class SplatsState:
             "ignore": ", ".join(self.ignore),
         }
         return {
-            "gaussians": sum(p.num_gaussians for p in parts) or "those of the scene's shapes",
+            "gaussians": sum(one.num_gaussians for one in rendered)
+            or "those of the scene's shapes",
             "sh_degree": self.sh_degree,
             "background": self.background,
             "near": self.near,
@@ -262,7 +263,7 @@ class SplatsState:
         """Check that own parameters fit together; keys: none for all."""
         if list(keys) != ["background"]:
             self.cache.forget("frames")
-            self.cache.gathered = None
+            self.cache.parts = None
         if not self.own.has_gaussians:
             return
         own = self.own
@@ -291,14 +292,14 @@ class SplatsState:
         """Rendered Gaussians, world space; attached where they are the parameters."""
         if self.cache.shaded is not None:
             return self.cache.shaded
-        if self.cache.gathered is None and (self.own.is_moved or self.nested_objects):
-            from drgs.integrator.gathering import gather
+        if self.cache.parts is None and (self.own.is_moved or self.nested_objects):
+            from drgs.integrator.parts import combine
 
-            self.cache.gathered = gather(self._placements(), None)
-        gathered = self.cache.gathered
-        return self.rendered_part_of(self.own) if gathered is None else gathered.gaussians
+            self.cache.parts = combine(self._placements(), None)
+        parts = self.cache.parts
+        return self.rendered_part_of(self.own) if parts is None else parts.gaussians
 
-    def gather(self, scene: mi.Scene) -> None:
+    def update_gaussians(self, scene: mi.Scene) -> None:
         """Find the scene's Gaussians, and convert them if they have changed."""
         cache, self.cache.shaded = self.cache, None
         for one in self.objects.values():  # an update that was refused may have left rows
@@ -311,13 +312,13 @@ class SplatsState:
             is_alone = not (
                 shapes or set(self.sh_rotations) - {""} or self.nested_objects or is_moved
             )
-            parts = [] if is_alone else self.parts(shapes)
+            parts = [] if is_alone else self.attached_parts(scene)
         if is_alone:
-            cache.gathered = None
+            cache.parts = None
         else:
-            from drgs.integrator.gathering import gather
+            from drgs.integrator.parts import combine
 
-            cache.gathered = gather(parts, cache.gathered)
+            cache.parts = combine(parts, cache.parts)
         gaussians = self.gaussians
         if gaussians.num_gaussians == 0:
             raise PluginError(
@@ -327,17 +328,18 @@ class SplatsState:
             )
         check_degree(self.sh_degree, gaussians)
 
-    def parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
+    def attached_parts(self, scene: mi.Scene) -> list[Part]:
         """Return the Gaussians of objects and shapes, attached, in the order of rendering."""
         parts: list[Part] = [*self._placements()]
+        shapes = ellipsoids_in(scene)
         if shapes or self.sh_rotations:
-            from drgs.integrator.gathering import conversions_of
+            from drgs.integrator.parts import conversions_of
 
             parts += conversions_of(shapes, self.sh_rotations)
         return parts
 
     def _placements(self) -> list[Placement]:
-        from drgs.integrator.gathering import Placement
+        from drgs.integrator.parts import Placement
 
         return [
             Placement.from_matrix(
@@ -348,8 +350,8 @@ class SplatsState:
 
     def accumulate(self, scene: mi.Scene, gradients: Gaussians) -> None:
         """Add derivatives with respect to :attr:`gaussians` to those of the parameters."""
-        if self.cache.gathered is not None:
-            self.cache.gathered.accumulate(self.parts(ellipsoids_in(scene)), gradients)
+        if self.cache.parts is not None:
+            self.cache.parts.accumulate(self.attached_parts(scene), gradients)
             return
         parameters = self.own.gaussians.arrays
         for name, gradient in gradients.arrays.items():
@@ -359,8 +361,8 @@ class SplatsState:
 
     def tangents(self, scene: mi.Scene) -> Gaussians:
         """Return derivatives of :attr:`gaussians` along those set on the parameters."""
-        if self.cache.gathered is not None:
-            return self.cache.gathered.tangents(self.parts(ellipsoids_in(scene)))
+        if self.cache.parts is not None:
+            return self.cache.parts.tangents(self.attached_parts(scene))
         own = self.rendered_part_of(self.own)
         return Gaussians.from_arrays({name: tangent_of(v) for name, v in own.arrays.items()})
 

@@ -26,7 +26,7 @@ MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
     "cameras.radial_tangential",
     "cameras.thin_prism_fisheye", "effects.defocus", "effects.occlusion",
-    "effects.smoothing", "gaussians.rotation", "gaussians.similarity", "integrator.gathering",
+    "effects.smoothing", "gaussians.rotation", "gaussians.similarity", "integrator.parts",
     "integrator.light.splat_transport", "integrator.light.shadows",
     "integrator.light.surfaces",
     "light", "light.grid", "light.probe", "light.walk",
@@ -336,6 +336,6 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "object in its place": [
             "drgs.gaussians.rotation",
             "drgs.gaussians.similarity",
-            "drgs.integrator.gathering",
+            "drgs.integrator.parts",
         ],
     }

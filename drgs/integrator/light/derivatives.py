@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from drgs.core.errors import UnsupportedError, format_names
 from drgs.integrator.light.rays import TransportIntegrator
-from drgs.integrator.state import SplatsState, ellipsoids_in
+from drgs.integrator.state import SplatsState
 
 ATTACHED_INTEGRATORS = ("PathIntegrator", "DirectIntegrator")  # samples move with parameters
 REPLAYED_INTEGRATORS = ("PRBIntegrator", "BasicPRBIntegrator")  # samples stay in place
@@ -67,7 +67,8 @@ def check_derivatives(
     splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode
 ) -> None:
     """Raise UnsupportedError for a parameter whose derivative would be wrong."""
-    parts = splats.parts(ellipsoids_in(scene)) if splats.light != "none" or splats.shadows else []
+    is_lit = splats.light != "none" or bool(splats.shadows)
+    parts = splats.attached_parts(scene) if is_lit else []
     if any(dr.grad_enabled(value) for part in parts for value in part.values.values()):
         raise UnsupportedError(
             f"splats: with light '{splats.light}' and shadows "

@@ -1,4 +1,4 @@
-"""Gaussians of an image, gathered from splat objects and shapes.
+"""Gaussians of an image from several parts: splat objects and shapes.
 
 Imported when a scene has more than the unmoved Gaussians of one integrator. Each :class:`Part`
 converts stored Gaussians to raw parameters in world space; Dr.Jit differentiates the conversions.
@@ -90,15 +90,15 @@ class Part(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class GatheredGaussians:
-    """Gathered Gaussians and their parts."""
+class CombinedParts:
+    """Parts, and the Gaussians of all."""
 
     parts: list[Part]  # detached
     sizes: list[tuple[int, int]]  # by part: number of Gaussians, degree
     gaussians: Gaussians  # detached and evaluated
 
     def matches(self, parts: Sequence[Part]) -> bool:
-        """Return whether gathering ``parts`` would give the same Gaussians."""
+        """Return whether ``parts`` would give the same Gaussians."""
         return same_variables(
             [part.values for part in self.parts], [part.values for part in parts]
         ) and [part.fixed_inputs for part in self.parts] == [part.fixed_inputs for part in parts]
@@ -136,7 +136,7 @@ class GatheredGaussians:
         return _concatenate(found, self.gaussians.sh_degree)
 
 
-def gather(parts: Sequence[Part], last: GatheredGaussians | None) -> GatheredGaussians:
+def combine(parts: Sequence[Part], last: CombinedParts | None) -> CombinedParts:
     """Return the Gaussians of all parts, in order and of the highest degree.
 
     last: the last result, returned again while nothing has changed. Features, coefficients and
@@ -149,7 +149,7 @@ def gather(parts: Sequence[Part], last: GatheredGaussians | None) -> GatheredGau
     sizes = [(part.num_gaussians, part.sh_degree) for part in converted]
     gaussians = _concatenate(converted, max(degree for _, degree in sizes))
     dr.eval(gaussians)
-    return GatheredGaussians(parts, sizes, gaussians)
+    return CombinedParts(parts, sizes, gaussians)
 
 
 def _concatenate(parts: Sequence[Gaussians], degree: int) -> Gaussians:
