@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 from itertools import chain, repeat
 from typing import TYPE_CHECKING
 
@@ -228,11 +228,11 @@ class SensorRender:
 
     def planes(self) -> Planes:
         """Return the planes of all frames, unevaluated."""
-        return [[frame.planes() for frame in of_time] for of_time in self._frames()]
+        return [[frame.planes() for frame in of_time] for of_time in self._frames]
 
     def plane_tangents(self, tangents: Gaussians) -> Planes:
         """Return tangents of planes along those of the Gaussians and of the sensor."""
-        frames = self._frames()
+        frames = self._frames
         with dr.resume_grad():
             d_cameras = self._camera_tangents(len(frames))
         return [
@@ -264,7 +264,7 @@ class SensorRender:
             is_attached = state.is_attached
         by_time = [
             rendering.frames_adjoint(self.splats.gaussians, *of_time, is_attached)
-            for of_time in zip(self._frames(), d_planes, strict=True)
+            for of_time in zip(self._frames, d_planes, strict=True)
         ]
         with dr.resume_grad():
             if of_background:
@@ -279,7 +279,7 @@ class SensorRender:
         behind = self._render_behind(constant)
         seen = repeat(repeat(None))
         if self.nested is not None:
-            seen = self._traced_surfaces(self.nested, self._state().detach()).value
+            seen = self._traced_surfaces(self.nested).value
         by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
         channels = [
             [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
@@ -360,7 +360,7 @@ class SensorRender:
         behind = splats.background if environment is None else environment
         assert isinstance(behind, (mi.Emitter, mi.Texture)), "a colour would be constant"
         state = self._state()
-        cameras = [of_time[0].camera for of_time in self._frames()]
+        cameras = [of_time[0].camera for of_time in self._frames]
         if state.is_attached:
             cameras = self._attached_cameras(state)
         from drgs.integrator.background import background_radiance
@@ -370,11 +370,12 @@ class SensorRender:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Background(colors, environment is not None, radiance)
 
+    @cached_property
     def _frames(self) -> list[list[rendering.Frame]]:
-        """Return frames by time and by pass, from the cache where nothing has changed."""
+        """Frames by time and by pass, from the cache where nothing has changed."""
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
-        state = self._state().detach()
-        traced = None if self.nested is None else self._traced_surfaces(self.nested, state)
+        state = self._detached
+        traced = None if self.nested is None else self._traced_surfaces(self.nested)
         key = (pipeline, self.key, *state.settings, traced), (gaussians, state.device)
 
         def render_all() -> list[list[rendering.Frame]]:
@@ -406,11 +407,10 @@ class SensorRender:
         frame = rendering.render(gaussians, camera, replace(pipeline, model=first))
         return [frame, *(rendering.render_again(frame, model) for model in others)]
 
-    def _traced_surfaces(
-        self, nested: NestedSurfaces, state: SensorState
-    ) -> Cached[list[list[SurfaceLayers]]]:
+    def _traced_surfaces(self, nested: NestedSurfaces) -> Cached[list[list[SurfaceLayers]]]:
         from drgs.integrator.light.visible_surfaces import trace_surfaces
 
+        state = self._detached
         hides, (_, far) = self.splats.hide_emitters, depth_range(self.sensor)
         settings = nested.surfaces, self.key, hides, far, *state.settings
         return self.splats.cache.find(
@@ -429,7 +429,7 @@ class SensorRender:
 
     def num_surfaces(self, nested: NestedSurfaces) -> int:
         """Return the number of surfaces that are seen one through the other."""
-        return len(self._traced_surfaces(nested, self._state().detach()).value[0][0])
+        return len(self._traced_surfaces(nested).value[0][0])
 
     @property
     def _offsets(self) -> list[tuple[Float | float, Float | float]]:
@@ -437,6 +437,10 @@ class SensorRender:
 
     def _state(self) -> SensorState:
         return read_sensor(self.sensor, self.splats.near)
+
+    @cached_property
+    def _detached(self) -> SensorState:
+        return self._state().detach()
 
     def _cameras(self, state: SensorState) -> list[Camera]:
         camera = without_effects(camera_from_sensor(state), self.splats.ignore)
