@@ -348,7 +348,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
 
     def _update(self, scene: mi.Scene) -> None:
         self.state.update_gaussians(scene)
-        if self.state.shadows:
+        if self.state.lighting.shadows:
             from drgs.integrator.light.shadows import shade
 
             shade(self.state, scene)

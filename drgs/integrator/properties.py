@@ -33,6 +33,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.light.rays import TransportIntegrator
 from drgs.integrator.state import (
     AOVS,
+    LightSettings,
     SplatObject,
     SplatsState,
     check_shapes,
@@ -111,12 +112,16 @@ SETTINGS = {
     "srgb_primitives": flag(True),
     "sh_degree": integer(None, 0, 3),
     "nested_spp": integer(0, least=0),
+}
+"""Settings of ``splats`` with single values, besides the approximations."""
+
+LIGHT_SETTINGS = {
     "light": one_of("none", "probe", "rays"),
     "light_samples": integer(4, 0, 4096),
     "probe_fallback": one_of("none", "rays"),
     "radiance_scale": positive(1.0),
 }
-"""Settings of ``splats`` with single values, besides the approximations."""
+"""Those of light between splats and surfaces."""
 
 FORMER_NAMES = {"unseen": "probe_fallback", "exposure": "radiance_scale"}
 """Names that properties of ``splats`` had, which are still read."""
@@ -139,7 +144,7 @@ KNOWN = (
         "ignore",
         "error",
     ),
-    *("smoothing", *SETTINGS, *DECLARED, *PARAMETER_NAMES),
+    *("smoothing", *SETTINGS, *LIGHT_SETTINGS, *DECLARED, *PARAMETER_NAMES),
 )
 """Properties of ``splats``, besides nested objects and names with a prefix."""
 
@@ -186,8 +191,11 @@ def read_state(
         aovs=_aovs(props, [*AOVS, *feature_widths(every)]),
         given_error=parse_budget(props.get("error")),
         ignore=_words(props, "ignore"),
-        probes=_words(props, "probes"),
-        shadows=_words(props, "shadows"),
+        lighting=LightSettings(
+            **read(props, LIGHT_SETTINGS),
+            probes=_words(props, "probes"),
+            shadows=_words(props, "shadows"),
+        ),
         **settings,
     )
     _check_settings(state)
@@ -197,13 +205,13 @@ def read_state(
 
 
 def _check_settings(state: SplatsState) -> None:
-    light, nested = state.light, state.nested
+    light, nested = state.lighting.light, state.nested
     if light != "none" and nested is not None and not isinstance(nested, TransportIntegrator):
         raise PluginError(
             f"splats: with light '{light}', the nested integrator must be splatpath, got "
             f"{nested.class_name()}; it takes max_depth, rr_depth and hide_emitters as path does"
         )
-    if light == "probe" and not state.probes:
+    if light == "probe" and not state.lighting.probes:
         raise PluginError(
             "splats: with light 'probe', probes must be ids of shapes and emitters, got none"
         )

@@ -113,6 +113,18 @@ class SplatObject:
         self.is_moved = not similarity_of(self.to_world.matrix, "splats: to_world").is_identity
 
 
+@dataclass(frozen=True)
+class LightSettings:
+    """Light between splats and surfaces, as ``docs/plugins/splats.md`` describes it."""
+
+    light: str
+    light_samples: int
+    probes: Sequence[str]
+    probe_fallback: str
+    shadows: Sequence[str]
+    radiance_scale: float
+
+
 @dataclass
 class SplatsState:
     """Gaussians, settings as ``docs/plugins/splats.md`` describes them, and a cache."""
@@ -132,12 +144,7 @@ class SplatsState:
     hide_emitters: bool
     srgb_primitives: bool
     nested_spp: int  # 0: as many as of the splats
-    light: str
-    light_samples: int
-    probes: Sequence[str]
-    probe_fallback: str
-    shadows: Sequence[str]
-    radiance_scale: float
+    lighting: LightSettings
     given_error: float | None  # budget of the approximations' error; None: as they are given
     budget_report: Any = None  # drgs.accuracy.error_budget.BudgetReport, once it was met
     cache: RenderCache = field(default_factory=RenderCache)
@@ -224,14 +231,15 @@ class SplatsState:
         parts = self.cache.parts
         own = [one.gaussians for one in self.objects.values()]
         rendered = own if parts is None else [parts.gaussians]
-        lit = {name: getattr(self, name) for name in ("light", "radiance_scale")}
+        lighting = self.lighting
+        lit = {"light": lighting.light, "radiance_scale": lighting.radiance_scale}
         others = {
             "objects": ", ".join(self.nested_objects),
             "hide_emitters": self.hide_emitters,
             "aovs": ", ".join(f"{name}:{kind}" for name, kind in self.aovs.items()),
             "nested": self.nested and self.nested.class_name(),
             "nested_spp": self.nested_spp,
-            **(lit if self.light != "none" else {}),
+            **(lit if lighting.light != "none" else {}),
             "ignore": ", ".join(self.ignore),
         }
         return {

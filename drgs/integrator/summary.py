@@ -89,7 +89,7 @@ def summary_of_sensors(
     )
     light = SimulatedEffect(
         "light between splats and surfaces",
-        None if splats.light == "none" else "along rays of surfaces",
+        None if splats.lighting.light == "none" else "along rays of surfaces",
         "the integrator's light",
     )
     of_integrator = _summary_of_integrator(splats, environment, of_cameras, splats.header)

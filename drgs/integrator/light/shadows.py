@@ -44,9 +44,11 @@ def shade(splats: SplatsState, scene: mi.Scene) -> None:
 
     def estimate() -> Gaussians:
         shapes = [node for node in surfaces.objects if isinstance(node, mi.Shape)]
-        check_ids("shadows must be ids of the scene's shapes", splats.shadows, shapes)
+        check_ids("shadows must be ids of the scene's shapes", splats.lighting.shadows, shapes)
         rays = _rays_through(surfaces.objects)
-        without = _rays_through([o for o in surfaces.objects if o.id() not in splats.shadows])
+        without = _rays_through(
+            [o for o in surfaces.objects if o.id() not in splats.lighting.shadows]
+        )
         blocked_by = ray_splats_of(gaussians, splats.approximations, degree=0)
         return _darken(gaussians, _Estimate(rays, without, blocked_by).ratios(gaussians))
 

@@ -81,8 +81,8 @@ class RayTransport(SplatTransport):
         found = splats.cache.find(
             "ray splats", settings, gaussians, lambda: ray_splats_of(gaussians, *settings)
         )
-        scale = dr.opaque(mi.Float, splats.radiance_scale)
-        return RayTransport(found.value, scale, splats.light_samples)
+        scale = dr.opaque(mi.Float, splats.lighting.radiance_scale)
+        return RayTransport(found.value, scale, splats.lighting.light_samples)
 
     @override
     def composite_segment(
@@ -150,7 +150,7 @@ def nested_with_transport(
         settings = {"type": "splatpath", "hide_emitters": splats.hide_emitters}
         nested = mi.load_dict(settings)
     assert isinstance(nested, TransportIntegrator), "checked with the settings"
-    if splats.light == "rays":
+    if splats.lighting.light == "rays":
         nested.use_transport(RayTransport.from_splats(splats))
     else:
         nested.use_transport(ProbeTransport.from_splats(splats, scene, num_paths, sensors))
@@ -186,7 +186,7 @@ class ProbeTransport(SplatTransport):
         sensors: Sequence[mi.Sensor],
     ) -> ProbeTransport:
         """Return the transport by probes; sensors: of flat mirrors. PluginError for unknown ids."""
-        objects = _objects(scene, splats.probes)
+        objects = _objects(scene, splats.lighting.probes)
         shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
         states = [read_sensor(sensor, splats.near).detach() for sensor in sensors]
@@ -195,12 +195,12 @@ class ProbeTransport(SplatTransport):
         return ProbeTransport(
             _probes(splats, objects, flat, states[0]),
             _mirror_images(splats, scene, list(delta_mirrors.values()), states),
-            dr.opaque(mi.Float, splats.radiance_scale),
+            dr.opaque(mi.Float, splats.lighting.radiance_scale),
             {k: mi.ShapePtr(shape) for k, shape in shapes.items()},
             {k: mi.EmitterPtr(node) for k, node in emitters.items() if node},
             {k: number for number, k in enumerate(delta_mirrors)},
             dr.opaque(mi.Float, num_paths),
-            RayTransport.from_splats(splats) if splats.probe_fallback == "rays" else None,
+            RayTransport.from_splats(splats) if splats.lighting.probe_fallback == "rays" else None,
         )
 
     @override

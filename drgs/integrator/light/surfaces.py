@@ -264,7 +264,7 @@ class NestedSurfaces:
         cache, hide_emitters = splats.cache, splats.hide_emitters
         surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
         count = splats.nested_spp or spp
-        if splats.light != "none":
+        if splats.lighting.light != "none":
             from drgs.integrator.light.splat_transport import nested_with_transport
 
             num_paths = count or sensor.sampler().sample_count()
