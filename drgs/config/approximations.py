@@ -222,8 +222,8 @@ class Approximations:
     @staticmethod
     def from_values(values: Mapping[str, Value | None]) -> Approximations:
         """Return those among ``values``; None gives the default."""
-        given = {name: value for name, value in values.items() if name in DECLARED}
-        return Approximations(**{k: v for k, v in given.items() if v is not None})
+        given: dict[str, Any] = {k: v for k, v in values.items() if k in DECLARED and v is not None}
+        return Approximations(**given)
 
     @property
     def non_default(self) -> dict[str, Value]:

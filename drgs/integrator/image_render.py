@@ -73,7 +73,8 @@ class ImageRender:
         film, spp = sensor.film(), spp or sensor.sampler().sample_count()
         poses = 1 if "motion" in splats.ignore else max(map(num_poses, sensors_of(sensor)))
         nested_spp = 0 if nested is None else nested.spp or spp
-        size = *film.crop_size(), spp, poses, len(names), nested_spp
+        width, height = film.crop_size()
+        size = width, height, spp, poses, len(names), nested_spp
         splats.cache.find("size", size, (), lambda: check_image(*size))
         maps = splats.cache.film_maps
         if spp == 1 and film.rfilter().is_box_filter():

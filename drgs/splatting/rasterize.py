@@ -222,10 +222,11 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
     columns[:PIXELS] = [dr.abs(T) for T in columns[:PIXELS]]
     ends = [ends[pixel] for pixel in range(PIXELS)]
     dr.eval(columns, ends)
-    values = scatter_rows(columns, lanes.micro_tile, size)
-    ends, stop = (scatter_rows(x, lanes.micro_tile, size) for x in (ends, [largest(ends)]))
-    dr.eval(values, ends, stop)
-    return CompositedTiles(bins, records, values, ends, stop, count)
+    values, *last = (
+        scatter_rows(each, lanes.micro_tile, size) for each in (columns, ends, [largest(ends)])
+    )
+    dr.eval(values, last)
+    return CompositedTiles(bins, records, values, *last, count)
 
 
 def sign_bits(value: Float) -> Int32:

@@ -264,14 +264,17 @@ class NestedSurfaces:
         cache, hide_emitters = splats.cache, splats.hide_emitters
         surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
         count = splats.nested_spp or spp
+        nested: mi.SamplingIntegrator
+        adjoint: mi.SamplingIntegrator
         if splats.lighting.light != "none":
             from drgs.integrator.light.splat_transport import nested_with_transport
 
             num_paths = count or sensor.sampler().sample_count()
             nested = adjoint = nested_with_transport(splats, scene, num_paths, sensors_of(sensor))
         else:
-            nested = adjoint = splats.nested
-            if nested is None:
+            if splats.nested is not None:
+                nested = adjoint = splats.nested
+            else:
                 # The same paths as ``path``, with correct derivatives for more parameters, and
                 # lamps seen through transparent surfaces.
                 adjoint = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
