@@ -222,11 +222,11 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
     columns[:PIXELS] = [dr.abs(T) for T in columns[:PIXELS]]
     ends = [ends[pixel] for pixel in range(PIXELS)]
     dr.eval(columns, ends)
-    values, *last = (
+    values, by_pixel, by_lane = (
         scatter_rows(each, lanes.micro_tile, size) for each in (columns, ends, [largest(ends)])
     )
-    dr.eval(values, last)
-    return CompositedTiles(bins, records, values, *last, count)
+    dr.eval(values, by_pixel, by_lane)
+    return CompositedTiles(bins, records, values, by_pixel, by_lane, count)
 
 
 def sign_bits(value: Float) -> Int32:
