@@ -76,10 +76,10 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
                 dr.traverse(dr.ADMode.Backward)
                 d_planes = dr.grad(planes)
             of_splats = composite_adjoint(tiles, d_planes)
-            found = gradients_of(self._gaussians, camera, self.pipeline, of_splats).parameters
+            gradients = gradients_of(self._gaussians, camera, self.pipeline, of_splats).parameters
         for name in PARAMETER_NAMES:
             if dr.grad_enabled(getattr(self, name)):
-                dr.accum_grad(getattr(self, name), getattr(found, name))
+                dr.accum_grad(getattr(self, name), getattr(gradients, name))
 
     @property
     def _gaussians(self) -> Gaussians:

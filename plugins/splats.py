@@ -174,19 +174,19 @@ class SplatsIntegrator(mi.CppADIntegrator):
     @override
     def traverse(self, cb: mi.TraversalCallback) -> None:
         state, own = self.state, self.state.own
-        found = {
+        exposed = {
             name: value
             for name, value in own.gaussians.arrays.items()
             if name != "smoothing" and (name not in PARAMETER_NAMES or dr.width(value) > 0)
         }
         if own.has_gaussians:
-            found["to_world"] = own.to_world
-        found |= self.objects
+            exposed["to_world"] = own.to_world
+        exposed |= self.objects
         if not self._is_object:
-            found["background"] = state.background
+            exposed["background"] = state.background
             if state.nested is not None:
-                found["nested"] = state.nested
-        for name, value in found.items():
+                exposed["nested"] = state.nested
+        for name, value in exposed.items():
             cb.put(name, value, mi.ParamFlags.Differentiable)
 
     @override

@@ -278,10 +278,10 @@ class SensorRender:
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
         """Return the mean over times of each pass's channels; constant: the background."""
         behind = self._render_behind(constant)
-        seen = repeat(repeat(None))
+        layers = repeat(repeat(None))
         if self.nested is not None:
-            seen = self._traced_surfaces(self.nested).value
-        by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
+            layers = self._traced_surfaces(self.nested).value
+        by_time = zip(planes, layers, behind.colors, behind.radiance, strict=False)
         channels = [
             [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
             for time in by_time
@@ -309,13 +309,13 @@ class SensorRender:
 
         def of_surfaces(kind: str) -> Channels | None:
             values = [surface.aov_values(kind, front) for surface, front in pairs]
-            found = [of_surface for of_surface in values if of_surface is not None]
-            return [_sum(terms) for terms in zip(*found, strict=True)] if found else None
+            terms = [value for value in values if value is not None]
+            return [_sum(columns) for columns in zip(*terms, strict=True)] if terms else None
 
         past = [transmittance_behind(layers) * planes[0], *planes[1:]]
-        own = self._to_channels(past, whole, behind, color, of_surfaces)
+        channels = self._to_channels(past, whole, behind, color, of_surfaces)
         assert self.nested is not None, "its surfaces are the layers"
-        return own + self.nested.compositor.values(layers, fronts, radiance)
+        return channels + self.nested.compositor.values(layers, fronts, radiance)
 
     def _to_channels(
         self,

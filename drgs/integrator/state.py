@@ -288,12 +288,12 @@ class SplatsState:
 
     def rendered_part_of(self, one: SplatObject, with_all_features: bool = False) -> Gaussians:
         """Return an object's Gaussians in its space, without unrendered filter and features."""
-        found, features = one.gaussians, one.gaussians.features or {}
+        gaussians, features = one.gaussians, one.gaussians.features or {}
         if "smoothing" in self.ignore:
-            found = replace(found, smoothing=None)
+            gaussians = replace(gaussians, smoothing=None)
         if not with_all_features:  # load only those that an AOV uses
             features = {k: v for k, v in features.items() if k in self.aovs.values()}
-        return replace(found, features=features or None)
+        return replace(gaussians, features=features or None)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -456,15 +456,15 @@ def check_instances(scene: mi.Scene, last: Sequence[mi.Shape]) -> list[mi.Shape]
 
 def feature_widths(objects: dict[str, SplatObject]) -> dict[str, int]:
     """Return the columns of features by name; PluginError where objects differ."""
-    found: dict[str, int] = {}
+    widths: dict[str, int] = {}
     for prefix, one in objects.items():
         for name, value in (one.gaussians.features or {}).items():
-            if found.setdefault(name, value.shape[1]) != value.shape[1]:
+            if widths.setdefault(name, value.shape[1]) != value.shape[1]:
                 raise PluginError(
-                    f"splats: {prefix}{name} must have the {found[name]} columns of the other "
+                    f"splats: {prefix}{name} must have the {widths[name]} columns of the other "
                     f"objects' {name}, got {value.shape[1]}"
                 )
-    return found
+    return widths
 
 
 def feature_of(kind: str) -> rendering.Feature:

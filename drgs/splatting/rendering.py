@@ -95,8 +95,8 @@ class DirectProjection(ProjectionStage):
         of_splats: SplatGradients,
         with_camera: bool,
     ) -> GaussianGradients:
-        found = gradients_of(gaussians, frame.camera, frame.pipeline, of_splats, with_camera)
-        return replace(found, visible=on_film(frame.tiles.bins))
+        total = gradients_of(gaussians, frame.camera, frame.pipeline, of_splats, with_camera)
+        return replace(total, visible=on_film(frame.tiles.bins))
 
 
 def load_unchanged(rows: GaussianRows) -> GaussianRows:
@@ -257,9 +257,9 @@ def gradients_of(
 
     See :func:`frames_adjoint`; ``visible`` does not include the bounds of the film.
     """
-    found, of_rows = gradients_by_row(gaussians, camera, pipeline, of_splats, with_camera)
+    total, by_row = gradients_by_row(gaussians, camera, pipeline, of_splats, with_camera)
     # dr.sum adds in the same order in every run.
-    return replace(found, camera=[dr.sum(each) for each in of_rows]) if with_camera else found
+    return replace(total, camera=[dr.sum(each) for each in by_row]) if with_camera else total
 
 
 def gradients_by_row(
@@ -279,15 +279,9 @@ def gradients_by_row(
     columns = _columns_of(d_rows, gaussians, visible)
     faults = _nonfinite_flags(d_rows, visible)
     parameters = _as_tensors(columns, gaussians, [faults])
-    of_rows = [dr.select(visible, number, 0) for number in d_numbers]
-    dr.eval(of_rows)
-    found = GaussianGradients(
-        parameters=parameters,
-        means2d=of_splats.means2d,
-        visible=visible,
-        first_nonfinite=dr.min(faults),
-    )
-    return found, of_rows
+    by_row = [dr.select(visible, number, 0) for number in d_numbers]
+    dr.eval(by_row)
+    return GaussianGradients(parameters, of_splats.means2d, visible, dr.min(faults)), by_row
 
 
 @dataclass(frozen=True)
@@ -312,19 +306,19 @@ def sum_of_views(
     rows, faults = load_rows(gaussians, views[0][0].pipeline.sh_degree), []
     total: dict[str, list[Float]] = {}
     for view in views:
-        of_times = []
-        for seen in view:
-            own = dr.copy(rows)  # separates the derivatives of the cameras
-            d_rows, visible, _ = _back_to_rows(own, seen.camera, seen.pipeline, seen.gradients)
+        flags = []
+        for each in view:
+            copy = dr.copy(rows)  # separates the derivatives of the cameras
+            d_rows, visible, _ = _back_to_rows(copy, each.camera, each.pipeline, each.gradients)
             columns = _columns_of(d_rows, gaussians, visible)
             total = _sum_of_columns(total, columns) if total else columns
-            of_times.append(_nonfinite_flags(d_rows, visible))
-        faults.append(reduce(dr.minimum, of_times))
+            flags.append(_nonfinite_flags(d_rows, visible))
+        faults.append(reduce(dr.minimum, flags))
     return _as_tensors(total, gaussians, faults), [dr.min(each) for each in faults]
 
 
 def _sum_of_columns(a: dict[str, list[Float]], b: dict[str, list[Float]]) -> dict[str, list[Float]]:
-    return {name: [x + y for x, y in zip(own, b[name], strict=True)] for name, own in a.items()}
+    return {name: [x + y for x, y in zip(v, b[name], strict=True)] for name, v in a.items()}
 
 
 def _back_to_rows(
@@ -474,9 +468,9 @@ def _columns_of(
     columns["smoothing"] = [] if d_rows.smoothing is None else [d_rows.smoothing]
     columns |= d_rows.features or {}
     return {
-        name: [dr.select(visible, column, t.Float(0)) for column in own]
-        for name, own in columns.items()
-        if len(own)
+        name: [dr.select(visible, component, t.Float(0)) for component in components]
+        for name, components in columns.items()
+        if len(components)
     }
 
 
@@ -497,7 +491,7 @@ def _as_tensors(
 ) -> Gaussians:
     """Return columns as tensors shaped like the parameters, evaluated together with ``others``."""
     t = types_of(type(gaussians.logit_opacities))
-    stored = {name: store_columns(own) for name, own in columns.items()}
+    stored = {name: store_columns(c) for name, c in columns.items()}
     dr.eval(stored, others)
 
     def gradient(name: str, like: TensorXf | Float) -> TensorXf | Float:
