@@ -222,11 +222,16 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
     columns[:PIXELS] = [dr.abs(T) for T in columns[:PIXELS]]
     ends = [ends[pixel] for pixel in range(PIXELS)]
     dr.eval(columns, ends)
-    values, by_pixel, by_lane = (
-        scatter_rows(each, lanes.micro_tile, size) for each in (columns, ends, [largest(ends)])
+    stored = CompositedTiles(
+        bins=bins,
+        records=records,
+        values=scatter_rows(columns, lanes.micro_tile, size),
+        ends=scatter_rows(ends, lanes.micro_tile, size),
+        stop=scatter_rows([largest(ends)], lanes.micro_tile, size),
+        count=count,
     )
-    dr.eval(values, by_pixel, by_lane)
-    return CompositedTiles(bins, records, values, by_pixel, by_lane, count)
+    dr.eval(stored.values, stored.ends, stored.stop)
+    return stored
 
 
 def sign_bits(value: Float) -> Int32:
