@@ -500,7 +500,9 @@ def _as_tensors(
         flat = first_numbers(stored[name], dr.width(like))
         return t.TensorXf(flat, like.shape) if dr.is_tensor_v(like) else flat
 
-    likes = {n: v for n, v in gaussians.arrays.items() if n in stored or n != "smoothing"}
+    likes = gaussians.arrays
+    if "smoothing" not in stored:  # it is not differentiated
+        likes.pop("smoothing", None)
     return Gaussians.from_arrays({name: gradient(name, like) for name, like in likes.items()})
 
 
