@@ -429,7 +429,7 @@ def frames_tangent(
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
     direction = _splat_tangents(gaussians, frames[0], tangents, camera_tangents)
-    return [frame.order.tangent(frame.tiles, direction).planes() for frame in frames]
+    return [frame.order.tangent(frame.tiles, direction) for frame in frames]
 
 
 def _splat_tangents(
