@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from drgs.core.constants import MAX_INT
-from drgs.core.errors import one_line
+from drgs.core.errors import UserError, one_line
 
 Count = Annotated[int, Field(le=MAX_INT)]
 
 T = TypeVar("T")
+Model = TypeVar("Model", bound=BaseModel)
 
 if TYPE_CHECKING:
     Resolved = Annotated[T, "null before"]
@@ -66,7 +69,40 @@ def expectation(error: ErrorDetails) -> str:
             return f"must be {sign} {context[relation]:.10g}"
     if kind == "literal_error":
         return f"must be one of {context['expected']}"
-    return f"must be {_EXPECTED.get(kind.split('_')[0], error['msg'])}"
+    known = _EXPECTED.get(kind.split("_")[0])
+    if known is None or kind in ("string_pattern_mismatch", "too_short"):
+        return re.sub(r"^\w+ should", "must", error["msg"])
+    return f"must be {known}"
+
+
+def validate(kind: type[Model], content: object, where: str) -> Model:
+    """Return a part of a file; where: start of messages, followed by keys.
+
+    Raises :class:`UserError` naming the key, the expectation and the value.
+    """
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        raise UserError(f"{where}{explain_error(error.errors()[0])}") from None
+
+
+def parse_json(text: str | bytes, where: str) -> Any:
+    """Return the content of JSON; where: start of messages. Raises :class:`UserError`."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{where}not valid JSON: {one_line(error)}") from None
+
+
+def explain_error(error: ErrorDetails) -> str:
+    """Return key, expectation and value of one of pydantic's errors on the content of a file."""
+    parts = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]]
+    key = one_line("".join(parts).removeprefix("."), 200)
+    if error["type"] == "missing":
+        return f"{key} is missing"
+    expected = "must be an object" if error["type"] == "model_type" else expectation(error)
+    got = one_line(json.dumps(error["input"]), 60)
+    return f"{key or 'the content'} {one_line(expected, 200)}, got {got}"
 
 
 def format_value(value: object) -> str:

@@ -1,4 +1,4 @@
-"""Effects that a dataset calls for, chosen by measurement: :func:`examine`.
+"""Effects that a dataset needs, chosen by measurement: :func:`examine`.
 
 A short fit leaves some training photographs out. What they differ by from its renderings shows
 which effects are likely (:class:`drgs.training.findings.Finding`); each of these is simulated in a
@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import cast
@@ -24,7 +24,7 @@ from scipy.special import stdtrit
 from typing_extensions import override
 
 from drgs.cli.execution import select_variant
-from drgs.cli.progress import RunProgress
+from drgs.cli.progress import StepProgress
 from drgs.config.changes import given_keys, with_changes, with_iterations
 from drgs.config.extensions import EFFECTS
 from drgs.config.load import config_from
@@ -63,24 +63,11 @@ BORDER_PX, BORDER_TOLERANCE, MIN_BORDER_SHARE = 2, 0.04, 0.6
 Progress = Callable[[str, int, int], None]  # what is tried, iterations done, and of how many
 
 
-def _show_nothing(what: str, done: int, total: int) -> None:
-    del what, done, total
-
-
 @contextmanager
 def show_progress() -> Iterator[Progress]:
     """Show the progress of an examination on the terminal, within the block."""
-    with ExitStack() as bars:
-        shown: dict[str, RunProgress] = {}
-
-        def show(what: str, done: int, total: int) -> None:
-            if what not in shown:
-                shown[what] = bars.enter_context(RunProgress(f"examines {what}:", total))
-            shown[what].update(done, total)
-            if done == total:
-                bars.close()
-
-        yield show
+    with StepProgress("examining: ") as steps:
+        yield steps.update
 
 
 @dataclass(frozen=True)
@@ -151,7 +138,7 @@ def examine(
     config: FitConfig | Mapping[str, object] | None = None,
     progress: Progress | None = None,
 ) -> Examination:
-    """Return which effects the dataset's training photographs call for, with the evidence.
+    """Return which effects the dataset's training photographs need, with the evidence.
 
     config: of the fit, or nested mappings, by default all defaults; effects whose keys it gives are
     not examined. With a fit that is too short, or fewer than 20 training photographs, nothing is
@@ -169,10 +156,10 @@ def examine(
         return Examination((), 0, 0.0, note)
     given, short = given_keys(config), _shorten(resolve_defaults(config, dataset))
     split, factor = split_views(dataset)
-    progress = progress or _show_nothing
+    progress = progress or (lambda what, done, total: None)
     if mi.variant() is None:
         select_variant(VARIANTS[0])
-    base = short_fit(short, split, factor, partial(progress, "no effect"))
+    base = short_fit(short, split, factor, partial(progress, "baseline"))
     decisions = []
     for finding in _findings(base):
         if any(overlaps(key, other) for key in finding.changes for other in given):
@@ -307,8 +294,8 @@ def _findings(fit: ShortFit) -> list[Finding]:
     looks = [_look_for_background]
     names = [*EFFECTS.shipped_names, *(e.name for e in EFFECTS.installed_extensions())]
     looks += [EFFECTS.get(name).value.look_for for name in names]
-    found = [look(fit) for look in looks]
-    return [finding for finding in found if finding is not None]
+    findings = [look(fit) for look in looks]
+    return [finding for finding in findings if finding is not None]
 
 
 def _look_for_background(fit: ShortFit) -> Finding | None:

@@ -235,10 +235,10 @@ sys.path.insert(0, {tests!r})
 import drgs, mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_rgb")
 from dataclasses import replace
-from drgs.bench import scenes
 from drgs.training.effects.base import training_effects
 from drgs.fit.summary import summary_of_fit
 from support import small_capture as capture
+from support.trainers import make_trainer
 from support.viewer_rendering import VIEWER_RENDERING
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
@@ -249,8 +249,7 @@ ones = np.ones((capture.HEIGHT, capture.WIDTH), np.float32)
 def dataset(**extras):
     return replace(plain, train=tuple(replace(view, **extras) for view in plain.train))
 
-bench = scenes.Scene("small", scenes.bench_gaussians(300), scenes.bench_camera(48))
-scenes.trainer_of(bench, {{}}).step()
+make_trainer().step()
 found, known = {{"a plain fit": sorted(set(sys.modules) & set({modules!r}))}}, set()
 for name, extras, changes in (
     ("nothing", {{}}, {{}}),
