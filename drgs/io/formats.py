@@ -114,6 +114,7 @@ FORMATS: Registry[type[FileFormat]] = Registry(
         "sog": "drgs.io.sog",
         "glb": "drgs.io.glb",
         "splat": "drgs.io.splat",
+        "ksplat": "drgs.io.ksplat",
         "usd": "drgs.io.usd",
     },
 )

@@ -29,6 +29,7 @@ from drgs.fit import __main__ as fit
 from drgs.results.files import CHECKPOINT, CURVES, ORBIT, REPORT, VIEWER
 from support.attacks.attack import Fault, observed
 from support.commands import assert_ends_well, run_in_process
+from support.ksplat import content_of
 from support.small_capture import (
     HEIGHT,
     WIDTH,
@@ -126,6 +127,7 @@ def write_inputs(folder: Path) -> None:
     for suffix in (".ply", ".compressed.ply", ".spz", ".glb", ".sog"):
         blobs(12).save(folder / f"gaussians{suffix}")
     replace(blobs(12), shN=np.zeros((12, 0, 3), np.float32)).save(folder / "gaussians.splat")
+    (folder / "gaussians.ksplat").write_bytes(content_of([(blobs(12), 1)], 1))
     (folder / "fit.yml").write_text(yaml.safe_dump(SETTINGS))
     (folder / "photos.yml").write_text(yaml.safe_dump(SETTINGS | PHOTOGRAPHS))
     frame = {"transform_matrix": _pose(0.5)}
