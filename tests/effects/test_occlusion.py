@@ -15,7 +15,7 @@ from drgs.core.arrays import from_host
 from drgs.effects.occlusion import OccludedFeatures, Surface
 from drgs.reference import splatting as reference
 from drgs.reference.effects import render_with_surfaces
-from drgs.splatting import feature_groups, rendering
+from drgs.splatting import order, rendering
 from drgs.splatting.grid import TileGrid
 from drgs.testing import LAWS, Case, image_equals_reference
 
@@ -93,7 +93,7 @@ def test_law_holds(case, law):
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
 def test_surface_occludes_each_group_of_features(monkeypatch, law):
     """Two planes at a time, and the weights in front with each."""
-    monkeypatch.setitem(feature_groups.FEATURES_AT_ONCE, 8, 2)
+    monkeypatch.setitem(order.FEATURES_AT_ONCE, 8, 2)
     law(replace(CASES[0]))
 
 

@@ -9,8 +9,8 @@ from support.reference_lenses import gaussians_at
 from support.views import to_linear
 
 SETTINGS = (
-    *("light_samples", "exposure", "probes", "unseen", "shadows", "aovs", "smoothing"),
-    *("alpha_max", "alpha_cut"),
+    *("light_samples", "radiance_scale", "probes", "probe_fallback", "shadows"),
+    *("aovs", "smoothing", "alpha_max", "alpha_cut"),
 )
 """Integrator settings accepted by :func:`scene_of`."""
 
