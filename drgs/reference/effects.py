@@ -259,14 +259,18 @@ class Fisheye(Lens):
     @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         rho = np.linalg.norm(points[:, :2], axis=1)
-        theta = np.arctan2(rho, points[:, 2])
         # On the axis (x, y) = 0, whatever it is multiplied by.
-        theta_by_rho = theta / np.where(rho == 0, 1.0, rho)
-        polynomial = sum(
-            k * theta ** (2 * i) for i, k in enumerate([1.0, self.k1, self.k2, self.k3, self.k4])
-        )
-        spread = (polynomial * theta_by_rho)[:, None]
-        return camera.focal * spread * points[:, :2] + camera.principal
+        theta_by_rho = np.arctan2(rho, points[:, 2]) / np.where(rho == 0, 1.0, rho)
+        distorted = self.distort(theta_by_rho[:, None] * points[:, :2])
+        return camera.focal * distorted + camera.principal
+
+    def distort(self, places: np.ndarray) -> np.ndarray:
+        """Return (..., 2) places theta_d / theta (u, v) of places (u, v) = theta / rho (x, y).
+
+        They may be complex.
+        """
+        r2 = np.sum(places**2, axis=-1, keepdims=True)
+        return places * (1 + self.k1 * r2 + self.k2 * r2**2 + self.k3 * r2**3 + self.k4 * r2**4)
 
     @override
     def depths(self, camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -307,24 +311,14 @@ class ThinPrismFisheye(Fisheye):
     sy1: float = 0.0
 
     @override
-    def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        rho = np.linalg.norm(points[:, :2], axis=1)
-        theta_by_rho = np.arctan2(rho, points[:, 2]) / np.where(rho == 0, 1.0, rho)
-        distorted = self.distort(theta_by_rho[:, None] * points[:, :2])
-        return camera.focal * distorted + camera.principal
-
     def distort(self, places: np.ndarray) -> np.ndarray:
-        """Return (..., 2) places (u', v') of places (u, v) (..., 2), which may be complex."""
         u, v = places[..., 0], places[..., 1]
         r2 = u * u + v * v
-        q = 1 + self.k1 * r2 + self.k2 * r2**2 + self.k3 * r2**3 + self.k4 * r2**4
-        return np.stack(
-            [
-                u * q + 2 * self.p1 * u * v + self.p2 * (r2 + 2 * u * u) + self.sx1 * r2,
-                v * q + self.p1 * (r2 + 2 * v * v) + 2 * self.p2 * u * v + self.sy1 * r2,
-            ],
-            axis=-1,
-        )
+        tangential_and_prism = [
+            2 * self.p1 * u * v + self.p2 * (r2 + 2 * u * u) + self.sx1 * r2,
+            self.p1 * (r2 + 2 * v * v) + 2 * self.p2 * u * v + self.sy1 * r2,
+        ]
+        return super().distort(places) + np.stack(tangential_and_prism, axis=-1)
 
     @property
     @override
@@ -616,7 +610,6 @@ def sh_colors(
 
     degree: None for all that is stored.
     """
-    degree = gaussians.sh_degree if degree is None else degree
     directions = lens.view_directions(camera, gaussians.means)
     return np.maximum(reference.unclamped_colors(gaussians, directions, degree), 0.0)
 
@@ -637,11 +630,11 @@ def render(
     ``sh_colors``; threshold_width: see ``reference.composite``.
     """
     splats = project(gaussians, camera, lens, antialiased, defocus=defocus)
+    colors = sh_colors(gaussians, camera, lens, degree)
+    size = camera.width, camera.height
     return reference.composite(
-        splats.means2d, splats.conics, splats.opacities,
-        sh_colors(gaussians, camera, lens, degree), splats.depths, splats.visible,
-        background, camera.width, camera.height, threshold_width, splats.cuts, lens.period(camera),
-    )  # fmt: skip
+        splats, colors, background, *size, threshold_width, lens.period(camera)
+    )
 
 
 def lens_cameras(camera: Camera, defocus: ThinLens, num_samples: int) -> list[Camera]:

@@ -51,14 +51,13 @@ def composite_segments(
     rotations = reference.quat_to_rotation(gaussians.quats)
     whitening = np.transpose(rotations, (0, 2, 1)) / np.exp(gaussians.log_scales)[:, :, None]
     opacities = reference.sigmoid(gaussians.logit_opacities)
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
     passed = [
         _composite_segment(
             np.einsum("nij,nj->ni", whitening, origins[r] - gaussians.means),
             whitening @ directions[r],
             far[r],
             opacities,
-            np.maximum(reference.unclamped_colors(gaussians, directions[r][None], degree), 0.0),
+            np.maximum(reference.unclamped_colors(gaussians, directions[r][None], sh_degree), 0.0),
             (alpha_max, alpha_cut, stop, close),
         )
         for r in range(len(origins))

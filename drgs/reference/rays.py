@@ -290,7 +290,7 @@ def _splats(gaussians: Gaussians, camera: Camera, model: ImageModel) -> _Splats:
         depth_var=np.sum((affine.axes[:, 2] / z[:, None]) ** 2, axis=-1),
         whitened=whitened,
         colors=reference.sh_colors(gaussians, camera, degree),
-        sh=reference._sh_coefficients(gaussians, degree),
+        sh=gaussians.sh[:, : (degree + 1) ** 2],
     )
     return _rows(splats, (opacities > model.alpha_cut) & (extended | (model.low_pass > 0)))
 
