@@ -33,6 +33,8 @@ from math import inf, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
 from drgs.reference import splatting as reference
@@ -447,17 +449,13 @@ def _undistort(lens: OpenCV | ThinPrismFisheye, targets: np.ndarray, radius: flo
 @cache
 def _first_fold(lens: OpenCV | ThinPrismFisheye, radius: float) -> float:
     """Return the smallest r below ``radius`` with ``least_eigenvalue`` 0; ``radius``: none is."""
-    radii = np.geomspace(*FOLD_RADII, FOLD_STEPS)
+    radii = np.array([0.0, *np.geomspace(*FOLD_RADII, FOLD_STEPS)])
     radii = np.append(radii[radii < radius], radius * (1 - 1e-12)) if radius < inf else radii
     folded = np.flatnonzero(lens.least_eigenvalue(radii) <= 0)
     if len(folded) == 0:
         return radius
-    low, high = radii[max(folded[0] - 1, 0)], radii[folded[0]]
-    for _ in range(60):
-        middle = (low + high) / 2
-        is_folded = lens.least_eigenvalue(np.array([middle]))[0] <= 0
-        low, high = (low, middle) if is_folded else (middle, high)
-    return float(low)
+    between = radii[folded[0] - 1], radii[folded[0]]
+    return brentq(lambda r: lens.least_eigenvalue(np.array([r]))[0], *between, xtol=1e-15)
 
 
 def _film_border(camera: Camera) -> np.ndarray:
@@ -521,7 +519,7 @@ def project(
     an axis is r^2 / 4. Opacities are multiplied by sqrt(det(cov2d without r) / det(cov2d)), so
     that the integral over the film of a splat stays. So are ``Projection.cuts``: a splat that is
     seen in focus is seen out of focus, and ends at as many standard deviations. Both may be small,
-    but not below LEAST_CUT. ``Projection.depths`` are the lens's.
+    but not below MIN_CUT. ``Projection.depths`` are the lens's.
 
     Splats with a singular cov2d, which low_pass = 0 permits, are not visible.
 
@@ -688,32 +686,9 @@ def interpolate_pose(open: Pose, close: Pose, t: float) -> Pose:
     a turn apart there are two shortest arcs; which one is taken is not defined.
     """
     (rotation_open, center_open), (rotation_close, center_close) = open, close
-    w, *axis = _quat_of_rotation(rotation_close @ rotation_open.T)
-    half_angle = np.arctan2(np.linalg.norm(axis), w)
-    axis, _ = reference._normalize(np.array([axis]), fallback=(1.0, 0.0, 0.0))
-    quat = np.array([[np.cos(t * half_angle), *(np.sin(t * half_angle) * axis[0])]])
-    rotation = reference.quat_to_rotation(quat)[0] @ rotation_open
+    turn = Rotation.from_matrix(rotation_close @ rotation_open.T).as_rotvec()
+    rotation = Rotation.from_rotvec(t * turn).as_matrix() @ rotation_open
     return rotation, (1 - t) * center_open + t * center_close
-
-
-def _quat_of_rotation(rotation: np.ndarray) -> np.ndarray:
-    """Return the unit quaternion (4,), wxyz, w >= 0, of a rotation (3, 3).
-
-    With R(q) quadratic in q, trace(R(q)^T R) = q^T K q: the quaternion of R maximises it, and is
-    the eigenvector of K's largest eigenvalue (Bar-Itzhack, "New Method for Extracting the
-    Quaternion from a Rotation Matrix", JGCD 23(6), 2000). No case needs a division.
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    K = np.array(
-        [
-            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-        ]
-    )
-    quat = np.linalg.eigh(K).eigenvectors[:, -1]
-    return -quat if quat[0] < 0 else quat
 
 
 def camera_at(camera_open: Camera, camera_close: Camera, t: float) -> Camera:
@@ -838,37 +813,27 @@ def render_with_surfaces(
     composites is decided as without surfaces.
     """
     splats = reference.project(gaussians, camera)
-    colors = reference.sh_colors(gaussians, camera, gaussians.sh_degree)
     order = reference.depth_order(splats.depths, splats.visible)
-    shape = camera.height, camera.width
+    colors, depths = reference.sh_colors(gaussians, camera)[order], splats.depths[order]
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    color, depth, coverage = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
-    seen, without = np.ones(shape), np.ones(shape)  # transmittance with and without surfaces
-    finished = np.zeros(shape, dtype=bool)
-    before = np.ones((len(surfaces), *shape))
-    passed = np.zeros((len(surfaces), *shape), dtype=bool)
+    offsets = np.stack([x, y], axis=-1) - splats.means2d[order, None, None]
+    exponents = -0.5 * np.einsum("nhwa,nab,nhwb->nhw", offsets, splats.conics[order], offsets)
+    alphas = splats.opacities[order, None, None] * np.exp(exponents)
+    alphas = np.minimum(np.where(alphas < reference.ALPHA_CUT, 0, alphas), reference.ALPHA_MAX)
+    unfinished = np.cumprod(1 - alphas, axis=0) >= reference.TRANSMITTANCE_STOP
+    alphas = np.where(unfinished, alphas, 0)
 
-    def pass_surfaces(behind: np.ndarray) -> np.ndarray:
-        """The transmittance behind the surfaces that a splat (of the mask ``behind``) is behind."""
-        through = seen
-        for k, (_, alpha) in enumerate(surfaces):
-            passes = behind[k] & ~passed[k]
-            before[k] = np.where(passes, without, before[k])
-            through = np.where(passes, through * (1 - alpha), through)
-            passed[k] |= behind[k]
-        return through
-
-    for i in order:
-        seen = pass_surfaces(np.array([splats.depths[i] > z for z, _ in surfaces]))
-        offset = np.stack([x, y], axis=-1) - splats.means2d[i]
-        exponent = -0.5 * np.einsum("...a,ab,...b", offset, splats.conics[i], offset)
-        alpha = np.minimum(splats.opacities[i] * np.exp(exponent), reference.ALPHA_MAX)
-        alpha = np.where(alpha < reference.ALPHA_CUT, 0, alpha)
-        finished |= (alpha > 0) & (without * (1 - alpha) < reference.TRANSMITTANCE_STOP)
-        alpha = np.where(finished, 0, alpha)
-        color += (seen * alpha)[..., None] * colors[i]
-        coverage += seen * alpha
-        depth += seen * alpha * splats.depths[i]
-        seen, without = seen * (1 - alpha), without * (1 - alpha)
-    seen = pass_surfaces(np.ones_like(passed))
-    return SurfaceImage(color, coverage, depth, before, seen)
+    through = np.cumprod(1 - alphas, axis=0) / (1 - alphas)  # the splats in front of each
+    before = []
+    for z, alpha in surfaces:
+        is_behind = depths[:, None, None] > z
+        before.append(np.prod(np.where(is_behind, 1, 1 - alphas), axis=0))
+        through = np.where(is_behind, through * (1 - alpha), through)
+    weights = through * alphas
+    return SurfaceImage(
+        color=np.einsum("nhw,nc->hwc", weights, colors),
+        coverage=np.sum(weights, axis=0),
+        depth=np.einsum("nhw,n->hw", weights, depths),
+        before=np.array(before),
+        transmittance=np.prod(1 - alphas, axis=0) * np.prod([1 - a for _, a in surfaces], axis=0),
+    )

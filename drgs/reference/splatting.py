@@ -655,8 +655,9 @@ def project_gradients(
 ) -> dict[str, np.ndarray]:
     """Return the gradients with respect to means, quats, log_scales and logit_opacities.
 
-    d_splats: from ``composite_gradients``. Rows that are not visible get zero. A quaternion of norm zero gets zero. Where a ratio of the Jacobian is clamped, it is a
-    constant, and J still depends on z.
+    d_splats: from ``composite_gradients``. Rows that are not visible get zero, and so does a
+    quaternion of norm zero. Where a ratio of the Jacobian is clamped, it is a constant, and J still
+    depends on z.
 
     Not differentiated: the camera.
     """
