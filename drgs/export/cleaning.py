@@ -31,10 +31,15 @@ def add_cleaning_arguments(parser: CommandParser) -> None:
         metavar=corners,
         help="keep the Gaussians inside a box",
     )
-    add("--min-opacity", type=_opacity, metavar="P", help="remove less opaque Gaussians, 0 to 1")
+    add(
+        "--min-opacity",
+        type=finite_number,
+        metavar="P",
+        help="remove less opaque Gaussians, 0 to 1",
+    )
     add(
         "--max-size",
-        type=_size,
+        type=finite_number,
         metavar="S",
         help="remove Gaussians with a larger standard deviation, scene units",
     )
@@ -66,18 +71,6 @@ def add_cleaning_arguments(parser: CommandParser) -> None:
         "from the training cameras of a fit, else from around the model",
     )
     add_variant_argument(parser)
-
-
-def _opacity(text: str) -> float:
-    if not 0 <= (number := finite_number(text)) <= 1:
-        raise argparse.ArgumentTypeError(f"must be between 0 and 1, got {text}")
-    return number
-
-
-def _size(text: str) -> float:
-    if not (number := finite_number(text)) > 0:
-        raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
-    return number
 
 
 @dataclass(frozen=True)
