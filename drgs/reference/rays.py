@@ -39,9 +39,9 @@ Sources are those of ``reference``, and:
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import inf, isfinite
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 import pydantic
@@ -51,11 +51,7 @@ from pydantic import Field
 from drgs.reference import splatting as reference
 from drgs.reference.splatting import Camera, Gaussians, RenderedImage
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-D = TypeVar("D", bound="DataclassInstance")
-
+Rows = TypeVar("Rows")  # a dataclass of arrays (N, ...)
 
 MAX_PAIRS = 2**15
 """Pairs of a pixel and a splat that are evaluated at a time: some 100 numbers each, so 25 MB,
@@ -563,9 +559,9 @@ def _follows_closely(keys: np.ndarray, width: float) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------
 
 
-def _rows(data: D, chosen: np.ndarray) -> D:
-    """Return a dataclass of arrays (N, ...) with the rows that are ``chosen`` (N,) bool."""
-    return type(data)(**{field.name: getattr(data, field.name)[chosen] for field in fields(data)})
+def _rows(data: Rows, chosen: np.ndarray) -> Rows:
+    """Return some rows; chosen: indices, or a mask (N,)."""
+    return type(data)(**{name: array[chosen] for name, array in vars(data).items()})
 
 
 def pixel_centers(camera: Camera) -> np.ndarray:
