@@ -20,7 +20,6 @@ from drgs.core.environment import check_variant
 from drgs.core.errors import PluginError, UnsupportedError
 from drgs.core.types import Bool
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.integrator.checks import surfaces_in
 from drgs.integrator.image_render import ImageRender
 from drgs.integrator.properties import (
     check_object,
@@ -28,7 +27,7 @@ from drgs.integrator.properties import (
     parse_budget,
     read_state,
 )
-from drgs.integrator.state import BackwardResult
+from drgs.integrator.state import BackwardResult, surfaces_in
 from drgs.splatting.rendering import ProjectionStage
 
 
@@ -365,7 +364,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
     def _gather(self, scene: mi.Scene) -> None:
         self.state.gather(scene)
         if self.state.shadows:
-            from drgs.integrator.shadows import shade
+            from drgs.integrator.light.shadows import shade
 
             shade(self.state, scene)
         if self.state.error is not None and self.state.budget_report is None:

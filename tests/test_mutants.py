@@ -27,7 +27,7 @@ from support.instrumented import Instrumented
 from support.mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Switchboard
 
 from drgs.accuracy import exact, pixel_order, ray_colors
-from drgs.splatting import footprint, rasterize, reduction, rendering
+from drgs.splatting import footprint, order, rasterize, reduction, rendering
 from drgs.testing import (
     Case,
     adjoint_is_transpose,
@@ -59,7 +59,7 @@ class Copies:
             board,
             rasterize,
             derivatives=STAGES,
-            forward=["composite", "Records.from_ranks", "Layers.planes"],
+            forward=["composite", "Records.from_ranks", "CompositedTiles.planes"],
             **{name: sums[name] for name in SUMS},
         )
         self.chain = Instrumented(
@@ -92,7 +92,7 @@ class Copies:
             pixel_order,
             derivatives=["PixelOrder.adjoint", "PixelOrder.tangent"],
             forward=["PixelOrder.composite", "PixelOrder.keys"],
-            _OrderedLayers=pixel_order._OrderedLayers,  # as are layers
+            _OrderedTiles=pixel_order._OrderedTiles,  # as are tiles
         )
         self.colors = Instrumented(
             board,
@@ -110,29 +110,28 @@ class Copies:
 
     def frame(self, frame: rendering.Frame) -> rendering.Frame:
         """Return a frame of the package with the copies' derivatives."""
-        model, order = frame.bins.model, frame.order
-        falloff, features = model.falloff, model.features
+        bins, order = frame.tiles.bins, frame.order
+        falloff, features = bins.model.falloff, bins.model.features
         if isinstance(falloff, exact.RayFalloff):
             falloff = self.falloff["RayFalloff"](falloff.camera)
         if isinstance(features, ray_colors.RayColors):
             features = self.colors["RayColors"](features.sh_degree, features.camera)
         if isinstance(order, pixel_order.PixelOrder):
             order = self.order["PixelOrder"](order.window, order.depths)
-        model = replace(model, falloff=falloff, features=features)
-        return replace(frame, bins=replace(frame.bins, model=model), order=order)
+        bins = replace(bins, model=replace(bins.model, falloff=falloff, features=features))
+        return replace(frame, tiles=replace(frame.tiles, bins=bins), order=order)
 
     def stage(self, name: str) -> Callable:
         """Return the copy of a stage of compositing, which uses the copy of the model."""
 
-        def run(bins, *arguments):
+        def run(tiles, *arguments):
             given = {
                 name: value
-                for name, value in vars(bins.model).items()
+                for name, value in vars(tiles.bins.model).items()
                 if type(value).__module__ != footprint.__name__
             }
-            return self.kernels[name](
-                replace(bins, model=self.model["FootprintModel"](**given)), *arguments
-            )
+            bins = replace(tiles.bins, model=self.model["FootprintModel"](**given))
+            return self.kernels[name](replace(tiles, bins=bins), *arguments)
 
         return run
 
@@ -143,7 +142,7 @@ class Copies:
         for name in ("frames_adjoint", "frames_tangent"):
             patch.setattr(rendering, name, self.chain[name])
         for name in STAGES:
-            patch.setattr(rendering, name, self.stage(name))
+            patch.setattr(order, name, self.stage(name))
         # Frames of the forward pass, which is not the copy's, go back through this.
         patch.setattr(rendering.Projected, "gradients", self.chain["Projected"].gradients)
         patch.setattr(footprint, "GaussianFalloff", self.model["GaussianFalloff"])

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
 from drgs.core.errors import UnsupportedError
-from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.footprint import DEFAULT, FootprintModel, GaussianFalloff
+from drgs.splatting.footprint import DEFAULT, Cutoffs, FootprintModel, GaussianFalloff
 from drgs.splatting.projection import (
     color_at_mean,
     compensated_opacity,

@@ -20,8 +20,7 @@ from drgs.core.arrays import reinterpret, types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.types import Array3f, Float, UInt32
 from drgs.splatting.footprint import Footprint, GaussianFalloff, flat_columns
-from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid
-from drgs.splatting.lanes import load_pixels
+from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid, load_pixels
 from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,

@@ -21,8 +21,8 @@ from drgs.bench.scenes import Scene, trainer_of
 from drgs.core.arrays import types_of
 from drgs.core.types import UInt32
 from drgs.splatting import rasterize, rendering, tiles
-from drgs.splatting.grid import PIXELS
-from drgs.splatting.lanes import Cursor, Entries, load_lane_row, make_lanes
+from drgs.splatting.grid import PIXELS, load_lane_row, make_lanes
+from drgs.splatting.tiles import Cursor, Entries
 from drgs.training.trainer import Trainer
 
 STAGES = (
@@ -153,17 +153,17 @@ class Work:
 
 def count_work(frame: rendering.Frame) -> Work:
     """Count the frame's entries and pairs."""
-    bins, layers = frame.bins, frame.layers
+    tiles, bins = frame.tiles, frame.tiles.bins
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
-    stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
+    stop = dr.gather(t.UInt32, tiles.stop, lanes.micro_tile)
     entries = Entries(bins, lanes, stop)
-    ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
+    ends = load_lane_row(tiles.ends, lanes.micro_tile, 1)
     model = bins.model.bind(lanes, bins.grid)
 
     def body(cursor: Cursor, visited: UInt32, useful: UInt32) -> tuple[Cursor, UInt32, UInt32]:
         entry, active = entries.current(cursor)
-        geometry, _ = frame.records.load(entry, active)
+        geometry, _ = tiles.records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)
         for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
             useful = useful + dr.select((alpha.value > 0) & (entry < ends[pixel]), t.UInt32(1), 0)

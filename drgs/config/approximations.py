@@ -69,9 +69,9 @@ FALLOFFS = ClassRegistry("falloff", {"gaussian": "drgs.splatting.footprint"})
 """Subclasses of ``drgs.splatting.footprint.GaussianFalloff``."""
 
 ORDERS = ClassRegistry(
-    "order", {"center": "drgs.splatting.rendering", "pixel": "drgs.accuracy.pixel_order"}
+    "order", {"center": "drgs.splatting.order", "pixel": "drgs.accuracy.pixel_order"}
 )
-"""Subclasses of ``drgs.splatting.rendering.CenterOrder``."""
+"""Subclasses of ``drgs.splatting.order.CenterOrder``."""
 
 
 @dataclass(frozen=True)

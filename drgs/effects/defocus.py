@@ -16,8 +16,7 @@ from typing_extensions import override
 from drgs.cameras.camera import Camera
 from drgs.core.constants import NEGLIGIBLE_ALPHA
 from drgs.core.types import Array2f, Array3f, Bool, Float
-from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, SamplePositions
+from drgs.splatting.footprint import Cutoffs, Footprint, GaussianFalloff, Offsets, SamplePositions
 from drgs.splatting.projection import FilmShape, GaussianRows, Projection, Splats2D
 
 

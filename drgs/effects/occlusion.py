@@ -26,8 +26,7 @@ from typing_extensions import override
 from drgs.cameras.camera import Camera
 from drgs.core.types import Float
 from drgs.splatting.footprint import FeatureGroup, FootprintModel, SamplePositions, SplatFeatures
-from drgs.splatting.grid import PIXELS, Lanes, TileGrid
-from drgs.splatting.lanes import load_pixels
+from drgs.splatting.grid import PIXELS, Lanes, TileGrid, load_pixels
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,9 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.core.errors import UnsupportedError, format_names
-from drgs.integrator.checks import ellipsoids_in
-from drgs.integrator.rays import TransportIntegrator
-from drgs.integrator.state import SplatsState
+from drgs.integrator.light.rays import TransportIntegrator
+from drgs.integrator.state import SplatsState, ellipsoids_in
 
 ATTACHED_INTEGRATORS = ("PathIntegrator", "DirectIntegrator")  # samples move with parameters
 REPLAYED_INTEGRATORS = ("PRBIntegrator", "BasicPRBIntegrator")  # samples stay in place

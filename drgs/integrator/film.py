@@ -22,8 +22,7 @@ from drgs.core.arrays import divide, from_host, interleave, quotient, repeat_arr
 from drgs.core.errors import UnsupportedError
 from drgs.core.types import Float
 from drgs.splatting.footprint import PixelCenters, SamplePositions, flat_columns, total
-from drgs.splatting.grid import MICRO, Lanes, TileGrid
-from drgs.splatting.lanes import load_pixels
+from drgs.splatting.grid import MICRO, Lanes, TileGrid, load_pixels
 
 Channels = list[Float]  # by pass, each (samples * H * W,): red, green, blue, perhaps alpha, AOVs
 

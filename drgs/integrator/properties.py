@@ -28,9 +28,8 @@ from drgs.core.errors import PluginError, PluginTypeError, UserNote, did_you_mea
 from drgs.core.origin import WORLD, format_origin
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.checks import check_shapes
-from drgs.integrator.rays import TransportIntegrator
-from drgs.integrator.state import AOVS, SplatObject, SplatsState, feature_widths
+from drgs.integrator.light.rays import TransportIntegrator
+from drgs.integrator.state import AOVS, SplatObject, SplatsState, check_shapes, feature_widths
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
     from drgs.integrator.gathering import ShRotation

@@ -18,11 +18,10 @@ from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations, Value
 from drgs.core.arrays import tangent_of
 from drgs.core.constants import MAX_FEATURES
-from drgs.core.errors import PluginError
+from drgs.core.errors import PluginError, UnsupportedError
 from drgs.core.private import same_variables
 from drgs.core.types import Bool, Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.checks import check_degree, check_instances, check_shapes, ellipsoids_in
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:
@@ -52,7 +51,7 @@ class BackwardResult:
         times. Call it before a parameter changes.
         """
         sums = [rendering.weighted_sums(frame, plane)[0] for frame in self.frames]
-        return sum(sums[1:], sums[0]) / sum(frame.bins.grid.samples for frame in self.frames)
+        return sum(sums[1:], sums[0]) / sum(frame.tiles.bins.grid.samples for frame in self.frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +139,7 @@ class SplatsState:
     shadows: Sequence[str]
     exposure: float
     error: float | None  # budget of the approximations' error; None: as they are given
-    budget_report: Any = None  # drgs.integrator.error_budget.BudgetReport, once it was met
+    budget_report: Any = None  # drgs.accuracy.error_budget.BudgetReport, once it was met
     cache: RenderCache = field(default_factory=RenderCache)
     projection: rendering.ProjectionStage = field(default_factory=rendering.Projected)
 
@@ -167,13 +166,18 @@ class SplatsState:
     @property
     def pipeline(self) -> rendering.Pipeline:
         """Stages that the settings select."""
-        others = [feature_of(kind) for kind in self.aovs.values() if kind != "alpha"]
-        features = (rendering.color_features, *others)
-        pipeline = pipeline_of(self.approximations, self.sh_degree, features=features)
         gathered = self.cache.gathered
-        if gathered is not None and gathered.gaussians.smoothing is not None:
-            pipeline = replace(pipeline, of_smoothing=True)  # it scales with an object
-        return replace(pipeline, source=self.projection)
+        # A smoothing filter is differentiated where it scales with an object.
+        of_smoothing = gathered is not None and gathered.gaussians.smoothing is not None
+        kinds = tuple(self.aovs.values())
+        settings = self.approximations, self.sh_degree, of_smoothing, kinds, self.projection
+
+        def make() -> rendering.Pipeline:
+            others = [feature_of(kind) for kind in kinds if kind != "alpha"]
+            pipeline = pipeline_of(*settings[:2], (rendering.color_features, *others))
+            return replace(pipeline, of_smoothing=of_smoothing, source=self.projection)
+
+        return self.cache.find("pipeline", settings, (), make).value
 
     @property
     def approximations(self) -> Approximations:
@@ -261,12 +265,8 @@ class SplatsState:
     @property
     def gaussians(self) -> Gaussians:
         """Rendered Gaussians, world space; attached where they are the parameters."""
-        shaded = self.cache.shaded
-        return self.unshaded_gaussians if shaded is None else shaded
-
-    @property
-    def unshaded_gaussians(self) -> Gaussians:
-        """Rendered Gaussians, without the shadows of surfaces."""
+        if self.cache.shaded is not None:
+            return self.cache.shaded
         if self.cache.gathered is None and (self.own.is_moved or self.nested_objects):
             from drgs.integrator.gathering import gather
 
@@ -276,7 +276,7 @@ class SplatsState:
 
     def gather(self, scene: mi.Scene) -> None:
         """Find the scene's Gaussians, and convert them if they have changed."""
-        cache = self.cache
+        cache, self.cache.shaded = self.cache, None
         for one in self.objects.values():  # an update that was refused may have left rows
             check_shapes(self.rendered_part_of(one))
         cache.instances = check_instances(scene, cache.instances)
@@ -292,7 +292,7 @@ class SplatsState:
             from drgs.integrator.gathering import gather
 
             cache.gathered = gather(parts, cache.gathered)
-        gaussians = self.unshaded_gaussians
+        gaussians = self.gaussians
         if gaussians.num_gaussians == 0:
             raise PluginError(
                 "splats: there are no Gaussians: give the integrator 'filename' or tensors "
@@ -342,6 +342,75 @@ class SplatsState:
             **{name: tangent_of(getattr(own, name)) for name in PARAMETER_NAMES},
             features=own.features and {k: tangent_of(v) for k, v in own.features.items()},
         )
+
+
+def check_shapes(gaussians: Gaussians) -> None:
+    """Raise PluginError unless all parameters have rows for the same Gaussians."""
+    num = next(iter(gaussians.means.shape), 1)
+    if num == 0:
+        raise PluginError("splats: at least one Gaussian is needed, got none")
+    rows = {
+        "means": [(3,)],
+        "quats": [(4,)],
+        "log_scales": [(3,)],
+        "logit_opacities": [()],
+        "sh0": [(1, 3)],
+        "shN": [((degree + 1) ** 2 - 1, 3) for degree in range(4)],
+    }
+    for name, allowed in rows.items():
+        got = tuple(getattr(gaussians, name).shape)
+        if got not in [(num, *row) for row in allowed]:
+            expected = " or ".join(f"({', '.join(map(str, ('N', *row)))})" for row in allowed)
+            raise PluginError(
+                f"splats: {name} must have the shape {expected}, with N = {num} the rows of "
+                f"means, got {got}"
+            )
+    for name, tensor in (gaussians.features or {}).items():
+        if len(tensor.shape) != 2 or tensor.shape[0] != num or tensor.shape[1] == 0:
+            raise PluginError(
+                f"splats: {name} must have the shape (N, C), with N = {num} the rows of means and "
+                f"C at least 1, got {tuple(tensor.shape)}"
+            )
+    if gaussians.smoothing is not None and dr.width(gaussians.smoothing) != num:
+        raise PluginError(
+            f"splats: smoothing must have the shape (N), with N = {num} the rows of means, got "
+            f"({dr.width(gaussians.smoothing)},)"
+        )
+
+
+def check_degree(degree: int, gaussians: Gaussians) -> None:
+    """Raise PluginError for a spherical harmonics degree that the Gaussians do not have."""
+    if degree > gaussians.sh_degree:
+        raise PluginError(
+            f"splats: sh_degree must be an integer from 0 to {gaussians.sh_degree}, the degree of "
+            f"the Gaussians, got {degree}"
+        )
+
+
+def ellipsoids_in(scene: mi.Scene) -> list[mi.Shape]:
+    """Return the shapes of Gaussians, which are rendered as splats."""
+    return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
+
+
+def surfaces_in(scene: mi.Scene) -> list[mi.Shape]:
+    """Return the shapes that are no Gaussians."""
+    return [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
+
+
+def check_instances(scene: mi.Scene, last: Sequence[mi.Shape]) -> list[mi.Shape]:
+    """Raise UnsupportedError for instances of Gaussians; last: those already checked."""
+    instances = [shape for shape in scene.shapes() if shape.class_name() == "Instance"]
+    if not instances or list(map(id, instances)) == list(map(id, last)):
+        return instances
+    repeated, shapes = mi.traverse(scene).hierarchy, scene.shapes()
+    for node, (group, _) in repeated.items():
+        if isinstance(node, mi.Shape) and node.is_ellipsoids() and node not in shapes:
+            raise UnsupportedError(
+                f"splats: shape group '{group.id()}' holds Gaussians (shape '{node.id()}'), whose "
+                "instances are not supported: use a shape of type ellipsoids for each, with a "
+                "to_world, or a nested splats"
+            )
+    return instances
 
 
 def feature_widths(objects: dict[str, SplatObject]) -> dict[str, int]:

@@ -15,9 +15,8 @@ from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.effects.compose import without_effects
-from drgs.integrator.checks import surfaces_in
 from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
-from drgs.integrator.state import SplatsState
+from drgs.integrator.state import SplatsState, surfaces_in
 
 FILE_HEADER_REASON = "set by the file"  # for effects that the header of the Gaussians' file sets
 

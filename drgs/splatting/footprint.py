@@ -7,7 +7,7 @@ the 3DGS paper; others are in separate modules, imported when they are chosen:
 - *falloff*: alpha around a splat (:class:`GaussianFalloff`)
 - *positions*: sample positions in a pixel (:class:`SamplePositions`: :class:`PixelCenters`)
 - *features*: composited values of a splat (:class:`SplatFeatures`)
-- *cutoffs*: extent of splats and end of pixels (:class:`drgs.splatting.cutoffs.Cutoffs`)
+- *cutoffs*: extent of splats and end of pixels (:class:`Cutoffs`)
 """
 
 from __future__ import annotations
@@ -25,15 +25,46 @@ from drgs.cameras.camera import Camera
 from drgs.cameras.lens import shortest
 from drgs.config.approximations import FALLOFFS
 from drgs.core.arrays import is_float64, reinterpret, types_of
-from drgs.core.constants import WHITENING_SCALE
+from drgs.core.constants import (
+    ALPHA_CUT,
+    ALPHA_MAX,
+    NEGLIGIBLE_ALPHA,
+    TRANSMITTANCE_STOP,
+    WHITENING_SCALE,
+)
 from drgs.core.types import Array2f, Bool, Float
-from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
 from drgs.splatting.projection import Splats2D
 
 # ----------------------------------------------------------------------------------------------
 # Alpha
 # ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Cutoffs:
+    """Limits at which splats and pixels end. Host numbers: each value compiles its own kernels.
+
+    None of these decisions is differentiated; ``drgs.core.constants`` has the sources of defaults.
+    """
+
+    alpha_max: float = ALPHA_MAX  # largest alpha, below 1
+    alpha_cut: float = ALPHA_CUT  # smallest alpha that is composited; 0: none
+    transmittance_stop: float = TRANSMITTANCE_STOP  # a pixel's last transmittance; 0: none
+    extent: float = math.inf  # standard deviations from the mean beyond which a splat ends
+
+    @property
+    def least_alpha(self) -> float:
+        """``alpha_cut``; where that is 0, an alpha too small to change any sum."""
+        return max(self.alpha_cut, NEGLIGIBLE_ALPHA)
+
+    def log2_floor(self, log2_opacity: Float) -> Float | float:
+        """The base-2 logarithm of the smallest alpha of a splat."""
+        least = math.log2(self.least_alpha)
+        if math.isinf(self.extent):
+            return least
+        at_extent = log2_opacity - 0.5 * math.log2(math.e) * self.extent**2
+        return dr.select(at_extent > least, at_extent, least)
 
 
 def exp2_short(x: Float) -> Float:
@@ -356,6 +387,11 @@ class FeatureGroup:
     stored: list[int]  # indices of the stored numbers that they need
     planes: list[int]  # indices of their planes; a plane may belong to several groups
     features: SplatFeatures
+
+    @property
+    def places(self) -> list[int]:
+        """Indices of all planes of the group, among those of the image: transmittance first."""
+        return [0, *(1 + plane for plane in self.planes)]
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,11 @@ import drjit as dr
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import load_columns, types_of
-from drgs.core.constants import LOW_PASS, MIN_LOW_PASS_PX2, NEGLIGIBLE_ALPHA
+from drgs.core.constants import ALPHA_CUT, LOW_PASS, MIN_LOW_PASS_PX2, NEGLIGIBLE_ALPHA
 from drgs.core.types import Array2f, Array3f, Array4f, Bool, Float, TensorXf
 from drgs.gaussians import sh
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import normalize, quat_to_rotation
-from drgs.splatting.cutoffs import Cutoffs
 
 
 @dataclass(frozen=True)
@@ -165,7 +164,7 @@ def project(
     shape: Projection | None = None,
     color: SplatColor | None = None,
     low_pass: float = LOW_PASS,
-    least_alpha: float = Cutoffs().least_alpha,
+    least_alpha: float = ALPHA_CUT,
 ) -> Splats2D:
     """Project Gaussians onto the image plane of ``camera``.
 

@@ -6,8 +6,8 @@ effect that is not part of it adds no instruction to any kernel. ``drgs.accuracy
 pipeline from names.
 
 The chain is  Gaussians -> ``project`` -> Splats2D -> ``footprints_of`` -> Footprints
--> ``bin_footprints`` -> TileBins -> ``composite`` -> Layers.  The adjoint runs backwards: the
-hand-written adjoint of compositing gives the derivatives of the 2D splats, and Dr.Jit
+-> ``bin_footprints`` -> TileBins -> ``composite`` -> CompositedTiles.  The adjoint runs backwards:
+the hand-written adjoint of compositing gives the derivatives of the 2D splats, and Dr.Jit
 differentiates projection and SH, which are traced again, one Gaussian per lane, so no gradient is
 scattered.
 """
@@ -15,7 +15,7 @@ scattered.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any, Protocol
 
@@ -23,19 +23,17 @@ import drjit as dr
 from typing_extensions import override
 
 from drgs.cameras.camera import Camera
-from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import first_numbers, repeat_array, store_columns, types_of
 from drgs.core.constants import LOW_PASS
 from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.splatting.feature_groups import group_features
 from drgs.splatting.footprint import DEFAULT, FootprintModel
 from drgs.splatting.grid import TileGrid
+from drgs.splatting.order import CenterOrder, group_features
 from drgs.splatting.projection import (
     GaussianRows,
     OpacityRule,
     Projection,
-    ProjectionModel,
     SplatColor,
     Splats2D,
     color_at_mean,
@@ -44,15 +42,7 @@ from drgs.splatting.projection import (
     plain_opacity,
     project,
 )
-from drgs.splatting.rasterize import (
-    ONE_SAMPLE,
-    Layers,
-    Records,
-    SplatGradients,
-    composite,
-    composite_adjoint,
-    composite_tangent,
-)
+from drgs.splatting.rasterize import CompositedTiles, SplatGradients
 from drgs.splatting.tiles import Footprints, TileBins, bin_footprints, footprints_of
 
 Feature = Callable[[Splats2D, GaussianRows, Camera], list[Float]]
@@ -69,62 +59,6 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
     """Return camera z, scene units: one plane, the alpha-weighted sum of the depths."""
     del rows, camera
     return [splats.depths]
-
-
-@ORDERS.register("center")
-@dataclass(frozen=True)
-class CenterOrder:
-    """The order of compositing, by the depth of the means; the base of all orders."""
-
-    @classmethod
-    def create(
-        cls, projection: type[ProjectionModel], approximations: Approximations
-    ) -> tuple[Projection, CenterOrder]:
-        """Return the projection, extended by the inputs of the order, and the order."""
-        del approximations
-        return projection.shape, cls()
-
-    def for_camera(self, camera: Camera) -> CenterOrder:
-        """Return this order for one camera; here, it is independent of the camera."""
-        del camera
-        return self
-
-    def keys(self, splats: Splats2D) -> list[Float]:
-        """Return further columns for compositing, if the order needs any."""
-        del splats
-        return []
-
-    def sort_depths(self, splats: Splats2D) -> Float:
-        """Return the sort keys of the splats, Float (N,), in ascending order."""
-        return splats.depths
-
-    def records(self, bins: TileBins) -> Records:
-        """Return the rows that compositing loads, one per sorted entry, evaluated."""
-        return Records.from_ranks(bins, bins.rows.load)
-
-    def composite(self, bins: TileBins, records: Records) -> Layers:
-        """Composite front to back."""
-        return composite(bins, records)
-
-    def adjoint(
-        self,
-        bins: TileBins,
-        records: Records,
-        layers: Layers,
-        d_features: list[Float],
-        d_transmittance: Float,
-        samples: range = ONE_SAMPLE,
-        before: SplatGradients | None = None,
-    ) -> SplatGradients:
-        """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
-        d_planes = d_features, d_transmittance
-        return composite_adjoint(bins, records, layers, *d_planes, samples, before)
-
-    def tangent(
-        self, bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
-    ) -> Layers:
-        """See :func:`drgs.splatting.rasterize.composite_tangent`."""
-        return composite_tangent(bins, records, layers, tangents)
 
 
 class ProjectionStage(Protocol):
@@ -154,7 +88,7 @@ class Projected(ProjectionStage):
         self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
     ) -> GaussianGradients:
         found = gradients_of(gaussians, frame.camera, frame.pipeline, of_splats, of_camera)
-        return replace(found, visible=on_film(frame.bins))
+        return replace(found, visible=on_film(frame.tiles.bins))
 
 
 def load_unchanged(rows: GaussianRows) -> GaussianRows:
@@ -174,7 +108,7 @@ class Pipeline:
     color: SplatColor = color_at_mean  # stored numbers of a splat's colour
     low_pass: float = LOW_PASS  # px^2
     model: FootprintModel = DEFAULT
-    order: CenterOrder = CenterOrder()
+    order: CenterOrder = field(default_factory=CenterOrder)
     source: ProjectionStage = Projected()
     of_smoothing: bool = False  # whether the smoothing filter is differentiated
 
@@ -212,16 +146,14 @@ class Frame:
     pipeline: Pipeline
     camera: Camera
     order: CenterOrder  # the pipeline's, for this camera
-    bins: TileBins
-    records: Any  # of that order
-    layers: Layers  # of that order
+    tiles: CompositedTiles  # of that order
 
     def planes(self) -> list[Float]:
         """Return transmittance, then the pipeline's features, unevaluated.
 
         Each is Float (samples * H * W,), sample by sample.
         """
-        return self.layers.planes()
+        return self.tiles.planes()
 
 
 @dataclass(frozen=True)
@@ -246,9 +178,7 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     grid = TileGrid(camera.width, camera.height, model.positions.samples)
     bins = bin_footprints(pipeline.source.footprints(gaussians, camera, pipeline), grid, model)
     order = group_features(pipeline.order.for_camera(camera), bins)
-    records = order.records(bins)
-    layers = order.composite(bins, records)
-    return Frame(pipeline, camera, order, bins, records, layers)
+    return Frame(pipeline, camera, order, order.composite(bins, order.records(bins)))
 
 
 def project_footprints(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
@@ -268,9 +198,10 @@ def render_again(frame: Frame, model: FootprintModel) -> Frame:
     model: that of the frame's pipeline, except for sample positions within the same margin, or
     features of the same stored numbers.
     """
-    grid = replace(frame.bins.grid, samples=model.positions.samples)
-    bins = replace(frame.bins, grid=grid, model=model.for_camera(frame.camera))
-    return replace(frame, bins=bins, layers=frame.order.composite(bins, frame.records))
+    bins = frame.tiles.bins
+    grid = replace(bins.grid, samples=model.positions.samples)
+    bins = replace(bins, grid=grid, model=model.for_camera(frame.camera))
+    return replace(frame, tiles=frame.order.composite(bins, frame.tiles.records))
 
 
 def frames_adjoint(
@@ -292,12 +223,12 @@ def frames_adjoint(
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
     total = None
-    for frame, (d_transmittance, *d_features) in zip(frames, d_planes, strict=True):
-        bins, inputs = frame.bins, (frame.records, frame.layers, d_features, d_transmittance)
+    for frame, of_frame in zip(frames, d_planes, strict=True):
+        bins = frame.tiles.bins
         at_once = max(1, ENTRIES_AT_ONCE // max(bins.num_entries, dr.width(bins.order)))
         for first in range(0, bins.grid.samples, at_once):
             samples = range(first, min(first + at_once, bins.grid.samples))
-            total = frame.order.adjoint(bins, *inputs, samples, total)
+            total = frame.order.adjoint(frame.tiles, of_frame, samples, total)
     assert total is not None, "there is at least one frame"
     return frames[0].pipeline.source.gradients(gaussians, frames[0], total, of_camera)
 
@@ -422,15 +353,13 @@ def weighted_sums(frame: Frame, *planes: Float) -> list[Float]:
     sum w_i g over pixels: here g is x for the first features and 0 for the rest. This reuses the
     adjoint's kernel, unless colours are evaluated along each pixel's ray.
     """
-    model, samples = frame.bins.model, frame.bins.grid.samples
-    bins = replace(
-        frame.bins, model=replace(model, features=model.features.with_weight_derivatives())
-    )
+    bins, samples = frame.tiles.bins, frame.tiles.bins.grid.samples
+    features = bins.model.features.with_weight_derivatives()
+    tiles = replace(frame.tiles, bins=replace(bins, model=replace(bins.model, features=features)))
     repeated = [repeat_array(plane, samples) for plane in planes]
     zeros = dr.opaque(type(repeated[0]), 0, dr.width(repeated[0]))
-    d_features = [*repeated, *[zeros] * (frame.layers.count - len(planes))]
-    inputs = frame.records, frame.layers, d_features, zeros
-    gradients = frame.order.adjoint(bins, *inputs, range(samples))
+    d_planes = [zeros, *repeated, *[zeros] * (tiles.count - len(planes))]
+    gradients = frame.order.adjoint(tiles, d_planes, range(samples))
     return gradients.features[: len(planes)]
 
 
@@ -489,7 +418,7 @@ def frames_tangent(
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
     direction = _splat_tangents(gaussians, frames[0], tangents, camera_tangents)
-    return [f.order.tangent(f.bins, f.records, f.layers, direction).planes() for f in frames]
+    return [frame.order.tangent(frame.tiles, direction).planes() for frame in frames]
 
 
 def _splat_tangents(
@@ -513,7 +442,7 @@ def _splat_tangents(
         dr.set_grad(differentiated, frame.pipeline.select_differentiable(d_rows))
         for number, tangent in zip(numbers, camera_tangents or [], strict=True):
             dr.set_grad(number, tangent)
-        falloff = frame.bins.model.falloff
+        falloff = frame.tiles.bins.model.falloff
         outputs = falloff.differentiable(splats)
         outputs += frame.pipeline.feature_columns(splats, rows, camera)
         # Some outputs (depths, p of the conic factor) are inputs of others: the default would clear

@@ -372,7 +372,7 @@ def outcome(name, samples=3) -> tuple[dict[str, np.ndarray], int]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_passes_of_several_samples_equal_single_sample_passes(name, monkeypatch):
-    monkeypatch.setattr("drgs.splatting.feature_groups.FEATURES_AT_ONCE", {4: 4, 8: 4})
+    monkeypatch.setattr("drgs.splatting.order.FEATURES_AT_ONCE", {4: 4, 8: 4})
     monkeypatch.setattr("drgs.integrator.film.PIXELS_PER_PASS", 1)
     expected, passes = outcome(name)
     assert passes == 3
@@ -384,7 +384,7 @@ def test_passes_of_several_samples_equal_single_sample_passes(name, monkeypatch)
         return passes
 
     monkeypatch.undo()
-    monkeypatch.setattr("drgs.splatting.feature_groups.FEATURES_AT_ONCE", {4: 4, 8: 4})
+    monkeypatch.setattr("drgs.splatting.order.FEATURES_AT_ONCE", {4: 4, 8: 4})
     assert check() == 1
     with monkeypatch.context() as patch:
         patch.setattr("drgs.splatting.rendering.ENTRIES_AT_ONCE", 1)

@@ -29,7 +29,7 @@ from drgs.effects.occlusion import OccludedFeatures, Surface
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 from drgs.reference.effects import render_with_surfaces
-from drgs.splatting import feature_groups, rendering
+from drgs.splatting import order, rendering
 from drgs.splatting.grid import TileGrid
 
 # Tolerances of test_rendering.
@@ -161,7 +161,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(precision, case):
 @pytest.mark.slow
 def test_surface_occludes_each_group_of_features(monkeypatch):
     """Two planes at a time, and the weights in front with each."""
-    monkeypatch.setitem(feature_groups.FEATURES_AT_ONCE, 8, 2)
+    monkeypatch.setitem(order.FEATURES_AT_ONCE, 8, 2)
     test_planes_match_the_reference(FLOAT64, CASES[0])
     test_gradients_equal_differences_of_the_reference(FLOAT64, CASES[0])
     test_adjoint_is_the_transpose_of_the_tangent(FLOAT64, CASES[0])

@@ -11,14 +11,14 @@ from support.lit_scenes import gaussians
 from support.rays import Rays, splats_of
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.integrator.rays import PathSegment
-from drgs.integrator.splat_transport import (
+from drgs.integrator.light.rays import PathSegment
+from drgs.integrator.light.splat_transport import (
     DECODING,
     ROULETTE_TRANSMITTANCE,
     RayTransport,
 )
 from drgs.light.walk import _hashes
-from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.footprint import Cutoffs
 
 RAYS, PATHS = 4, 8192
 

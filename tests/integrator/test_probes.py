@@ -9,7 +9,7 @@ from support.lit_scenes import FAR_AWAY, camera, gaussians, scene_of
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import PluginError
-from drgs.integrator.mirrors import FlatMirror, Mirrors
+from drgs.integrator.light.mirrors import FlatMirror, Mirrors
 from drgs.light.probe import Probes
 from drgs.reference import splatting
 from drgs.results import metrics

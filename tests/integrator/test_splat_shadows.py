@@ -8,8 +8,8 @@ from support.lit_scenes import scene_of as lit_scene
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import PluginError
-from drgs.integrator import shadows
-from drgs.integrator.shadows import GAMMA
+from drgs.integrator.light import shadows
+from drgs.integrator.light.shadows import GAMMA
 from drgs.reference import splatting
 
 

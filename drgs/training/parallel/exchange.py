@@ -34,8 +34,12 @@ from drgs.core.constants import MAX_SHUTTER_SAMPLES
 from drgs.core.types import Array2f, Bool, Float, UInt32
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.sensor_render import accumulate_in_sensor, attached_cameras
-from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.integrator.sensors import (
+    accumulate_in_sensor,
+    attached_cameras,
+    camera_from_sensor,
+    read_sensor,
+)
 from drgs.integrator.types import SplatsPlugin
 from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (

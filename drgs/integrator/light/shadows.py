@@ -23,9 +23,8 @@ import mitsuba as mi
 from drgs.core.constants import SH_C0
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.integrator.checks import check_ids
-from drgs.integrator.rays import StraightRays, has_transparent_parts
-from drgs.integrator.splat_transport import ray_splats_of
+from drgs.integrator.light.rays import StraightRays, has_transparent_parts
+from drgs.integrator.light.splat_transport import check_ids, ray_splats_of
 from drgs.integrator.state import SplatsState
 from drgs.integrator.surfaces import Surfaces, scene_of
 from drgs.light.walk import RaySplats, Segment
@@ -40,7 +39,7 @@ SHADOW_OFFSET_STDS = 3.0  # along the shortest axis: a splat's own alpha does no
 
 def shade(splats: SplatsState, scene: mi.Scene) -> None:
     """Shade the Gaussians by the objects that cast shadows; PluginError for unknown names."""
-    gaussians, cache = dr.detach(splats.unshaded_gaussians), splats.cache
+    gaussians, cache = dr.detach(splats.gaussians), splats.cache  # not shaded yet
     surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
 
     def estimate() -> Gaussians:
@@ -51,7 +50,6 @@ def shade(splats: SplatsState, scene: mi.Scene) -> None:
         blocked_by = ray_splats_of(gaussians, splats.approximations, degree=0)
         return _darken(gaussians, _Estimate(rays, without, blocked_by).ratios(gaussians))
 
-    cache.shaded = None
     cache.shaded = cache.find("shaded", (surfaces,), gaussians, estimate).value
 
 

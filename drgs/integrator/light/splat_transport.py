@@ -41,9 +41,8 @@ from drgs.config.approximations import Approximations
 from drgs.core.arrays import reinterpret
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.checks import check_ids
-from drgs.integrator.rays import PathSegment, SplatTransport, TransportIntegrator
-from drgs.integrator.sensor_render import decode
+from drgs.integrator.image_render import decode
+from drgs.integrator.light.rays import PathSegment, SplatTransport, TransportIntegrator
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import SplatsState
 from drgs.light.probe import CUBE_SIZE_TEXELS, LOW_PASS, NUM_LEVELS, ProbeHit, Probes
@@ -52,7 +51,7 @@ from drgs.splatting.projection import load_rows
 from drgs.splatting.rendering import color_features, depth_feature
 
 if TYPE_CHECKING:
-    from drgs.integrator.mirrors import FlatMirror, Mirrors
+    from drgs.integrator.light.mirrors import FlatMirror, Mirrors
 else:  # Dr.Jit evaluates annotations
     Mirrors = object
 
@@ -319,7 +318,7 @@ def _warn_of_close(
 
 def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int, FlatMirror]:
     """Return flat mirrors among the shapes, by the probe's number."""
-    from drgs.integrator.mirrors import FlatMirror
+    from drgs.integrator.light.mirrors import FlatMirror
 
     def recognise() -> dict[int, FlatMirror]:
         every = {k: FlatMirror.from_shape(shape) for k, shape in shapes.items()}
@@ -331,7 +330,7 @@ def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int,
 def _mirror_images(
     splats: SplatsState, scene: mi.Scene, mirrors: list[FlatMirror], states: list[SensorState]
 ) -> Mirrors | None:
-    from drgs.integrator.mirrors import Mirrors
+    from drgs.integrator.light.mirrors import Mirrors
 
     gaussians, surfaces = dr.detach(splats.gaussians), splats.cache.surfaces
     if not mirrors or surfaces is None:
@@ -369,6 +368,20 @@ def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Emitter | mi.Shap
     check_ids("probes must be ids of the scene's shapes and emitters", names, nodes)
     known = {node.id(): node for node in nodes}
     return [known[name] for name in names]
+
+
+def check_ids(parameter: str, names: Sequence[str], nodes: Sequence[mi.Object]) -> None:
+    """Raise PluginError for names that are no node's id; parameter: the property, in words."""
+    known = [node.id() for node in nodes]
+    for name in names:
+        if name not in known:
+            message = f"splats: {parameter}, got {name!r}; there are {', '.join(known)}"
+            if any(isinstance(node, mi.Mesh) and not node.id() for node in nodes):
+                message += (
+                    "; Mitsuba merges meshes with equal BSDFs, which then have no id: load the "
+                    "scene with optimize=False"
+                )
+            raise PluginError(message)
 
 
 def _center(node: mi.Emitter | mi.Shape) -> list[float]:

@@ -8,7 +8,7 @@ from support.kernels import drain_kernels
 
 import drgs
 from drgs.reference import splatting as reference
-from drgs.splatting.feature_groups import FEATURES_AT_ONCE
+from drgs.splatting.order import FEATURES_AT_ONCE
 
 CASE = clear(Case("feature groups", 37, 29, 0, seed=3))
 NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")

@@ -1,0 +1,1 @@
+"""Light between splats and surfaces, on Mitsuba's side: rays, transport, mirrors and shadows."""
