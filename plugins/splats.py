@@ -27,8 +27,7 @@ from drgs.integrator.properties import (
     parse_budget,
     read_state,
 )
-from drgs.integrator.state import BackwardResult, surfaces_in
-from drgs.splatting.rendering import ProjectionStage
+from drgs.integrator.state import BackwardResult, ProjectedView, surfaces_in
 
 
 class SplatsIntegrator(mi.CppADIntegrator):
@@ -241,9 +240,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
     near = property(attrgetter("state.near"), doc="Near plane, scene units.")
     ignore = property(attrgetter("state.ignore"), doc="Effects that are not simulated.")
 
-    def use_projection(self, stage: ProjectionStage) -> None:
-        """Project the Gaussians by another stage, such as one across several processes."""
-        self.state.projection = stage
+    @property
+    def projected(self) -> ProjectedView | None:
+        """Splats that are rendered instead of the Gaussians, by one sensor. May be set."""
+        return self.state.projected
+
+    @projected.setter
+    def projected(self, view: ProjectedView | None) -> None:
+        self.forget_frames()
+        self.state.projected = view
 
     @override
     def aov_names(self) -> list[str]:
@@ -289,15 +294,17 @@ class SplatsIntegrator(mi.CppADIntegrator):
         with self._lock, dr.suspend_grad():
             self._gather(scene)
             render = ImageRender.prepare(self.state, scene, sensor, seed, spp)
-            gradients = render.backward(params, grad_in)
-            means2d, frames = gradients.means2d, self.state.cache.kept["frames 0"].value
-            self.last = BackwardResult(
-                mi.TensorXf(interleave(list(means2d)), (dr.width(means2d), 2)),
-                gradients.visible,
-                gradients.first_nonfinite,
-                [frame for of_time in frames for frame in of_time],
-            )
-            if gradients.parameters is not None:
+            if self.projected is not None:
+                render.splats_backward(self.projected, grad_in)
+            else:
+                gradients = render.backward(params, grad_in)
+                means2d, frames = gradients.means2d, self.state.cache.kept["frames 0"].value
+                self.last = BackwardResult(
+                    mi.TensorXf(interleave(list(means2d)), (dr.width(means2d), 2)),
+                    gradients.visible,
+                    gradients.first_nonfinite,
+                    [frame for of_time in frames for frame in of_time],
+                )
                 with dr.resume_grad():
                     self.state.accumulate(scene, gradients.parameters)
             sensor.film().clear()  # it may hold an attached block

@@ -65,8 +65,8 @@ class Copies:
         self.chain = Instrumented(
             board,
             rendering,
-            derivatives=["frames_adjoint", "frames_tangent", "Projected.gradients"],
-            forward=["render", "Frame.planes", "Projected.footprints"],
+            derivatives=["frames_adjoint", "splats_adjoint", "frames_tangent"],
+            forward=["render_splats", "Frame.planes", "project_footprints"],
         )
         self.model = Instrumented(
             board,
@@ -143,8 +143,6 @@ class Copies:
             patch.setattr(rendering, name, self.chain[name])
         for name in STAGES:
             patch.setattr(order, name, self.stage(name))
-        # Frames of the forward pass, which is not the copy's, go back through this.
-        patch.setattr(rendering.Projected, "gradients", self.chain["Projected"].gradients)
         patch.setattr(footprint, "GaussianFalloff", self.model["GaussianFalloff"])
         patch.setattr(special_checks, "Alpha", self.model["Alpha"])
         patch.setattr(special_checks, "composite_step", self.kernels["composite_step"])

@@ -195,10 +195,10 @@ class ViewLoss:
     counted: float  # share of the pixels that count
 
 
-class WholeGradients:
-    """Steps of one view, with the gradients that ``dr.backward`` stores in the parameters.
+class OneView:
+    """The gradients of steps of one view, which ``dr.backward`` leaves in the parameters.
 
-    Steps of several views use :class:`drgs.training.parallel.exchange.ViewExchange`.
+    :class:`drgs.training.parallel.several_views.SeveralViews` has those of longer steps.
     """
 
     def __init__(self, integrator: SplatsPlugin) -> None:
@@ -206,7 +206,7 @@ class WholeGradients:
         self._views: Sequence[StepView] = ()
         self._sums: Mapping[str, Float] = {}
 
-    def begin(self, views: Sequence[StepView], place: Callable[[StepView], None]) -> None:
+    def begin(self, views: Sequence[StepView], move_sensor: Callable[[StepView], None]) -> None:
         """Start a step of one view."""
         self._views = views
 
@@ -214,7 +214,10 @@ class WholeGradients:
         """Return the step's view."""
         return self._views
 
-    def end_view(self, weights: Mapping[str, Float]) -> None:
+    def begin_view(self, view: StepView) -> None:
+        """Do nothing: the integrator renders its own Gaussians."""
+
+    def end_view(self, view: StepView, weights: Mapping[str, Float]) -> None:
         """Keep the weighted sums of the view."""
         last = self.integrator.last
         self._sums = {name: last.weighted_sums(plane) for name, plane in weights.items()}

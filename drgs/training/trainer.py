@@ -54,11 +54,11 @@ from drgs.training.rates import rates_over_time, revised_plan
 from drgs.training.read_ahead import ReadAhead
 from drgs.training.steps import (
     MAX_TARGET_BYTES,
+    OneView,
     Step,
     StepView,
     ViewGradients,
     ViewLoss,
-    WholeGradients,
     bytes_per_pixel,
     make_stages,
     plan_step,
@@ -143,11 +143,11 @@ class Trainer:
         self.terms = make_loss_terms(config)
         self.stages = make_stages(dataset.train, config, self.effects, room_bytes)
         self.read_ahead = ReadAhead(dataset.train, views_per_step, comm)
-        self.gradients: WholeGradients | ViewExchange = WholeGradients(self.integrator)
+        self.gradients: OneView | SeveralViews = OneView(self.integrator)
         if views_per_step > 1:
-            from drgs.training.parallel.exchange import ViewExchange
+            from drgs.training.parallel.several_views import SeveralViews
 
-            self.gradients = ViewExchange(comm, self.integrator, self.params, views_per_step)
+            self.gradients = SeveralViews(comm, self.integrator, self.params, views_per_step)
         self.population = make_population(
             self.optimizer, self.extent, config.seed, comm, gaussians.num_gaussians
         )
@@ -181,12 +181,14 @@ class Trainer:
         fit = self.fit_state(step, view.iteration)
         for effect in self.effects:
             effect.before_render(fit, view.view)
+        self.gradients.begin_view(view)
         rendered = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
         image, loss, error = self.compare(cast(TensorXf, rendered), view.view)
         dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
         image, photograph = dr.detach(image), view.view.target.image
         weights = self._pixel_weights(view.iteration)
-        self.gradients.end_view({name: weigh(image, photograph) for name, weigh in weights.items()})
+        planes = {name: weigh(image, photograph) for name, weigh in weights.items()}
+        self.gradients.end_view(view, planes)
         return ViewLoss(dr.detach(loss), error, view.view.counted_share)
 
     def _coming_views(self, step: Step, iteration: int) -> Iterator[TrainingView]:
