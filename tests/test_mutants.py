@@ -66,7 +66,7 @@ class Copies:
             board,
             rendering,
             derivatives=["frames_adjoint", "splats_adjoint", "frames_tangent"],
-            forward=["render_splats", "Frame.planes", "project_footprints"],
+            forward=["render", "Frame.planes"],
         )
         self.model = Instrumented(
             board,

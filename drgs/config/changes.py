@@ -40,15 +40,14 @@ def with_changes(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
 def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     """Change the number of iterations, and everything else in proportion.
 
-    ``densify.every`` stays, as statistics are gathered over views. Revisions of the means' rate and
-    of growth are dropped.
+    ``densify.every`` stays, as statistics are gathered over views.
     """
     share = iterations / config.iterations
 
     def scale_count(count: int) -> int:
         return max(1, round(count * share)) if count else 0  # 0: from the start
 
-    changes: dict[str, Any] = {"iterations": iterations}
+    changes: dict[str, Any] = {"iterations": iterations, "stop_after": None}
     for key in _COUNTS:
         count = _value(config, key)
         changes[key] = count if count is None else scale_count(count)
@@ -59,7 +58,6 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     if changes["densify.prune.stop"] is not None:
         least = max(changes["densify.stop"], changes["densify.prune.start"] or 0) + 1
         changes["densify.prune.stop"] = max(changes["densify.prune.stop"], least)
-    changes["optimizer.means_lr_aims"] = changes["densify.stop_aims"] = []
     return with_changes(config, changes)
 
 

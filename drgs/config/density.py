@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from drgs.config.extensions import STRATEGIES, StrategyName
 from drgs.config.section import UNRESOLVED, Count, Resolved, Section, subsection
@@ -158,13 +158,6 @@ class PruneConfig(Section):
     )
 
 
-class StopAim(Section):
-    """Target of growth after an iteration."""
-
-    after: Count = Field(ge=0, description="Last iteration before this value applies.")
-    stop: Count = Field(ge=1, description="Value of densify.stop from then on.")
-
-
 class DensifyConfig(Section):
     """Changes of the number of Gaussians."""
 
@@ -188,11 +181,6 @@ class DensifyConfig(Section):
         "at this iteration. Not given, or null: 3/4 of the iterations with budget, else 5/7 of "
         "them; with adc at most 15,000.",
     )
-    stop_aims: list[StopAim] = Field(
-        default_factory=list,
-        description="Earlier values of stop, before revisions of --budget: a list of "
-        "{after: iteration, stop: iteration}.",
-    )
     every: Count = Field(100, ge=1, description="Iterations between two changes.")
     max_gaussians: int = Field(
         1_000_000, ge=4, le=100_000_000, description="Limit that the population never exceeds."
@@ -206,19 +194,6 @@ class DensifyConfig(Section):
     budget: BudgetConfig = subsection(BudgetConfig)
     mcmc: McmcConfig = subsection(McmcConfig)
     prune: PruneConfig = subsection(PruneConfig)
-
-    def stop_at_iteration(self, iteration: int) -> int:
-        """Return the value of ``stop`` at this iteration."""
-        aims = [aim.stop for aim in self.stop_aims if aim.after < iteration]
-        return aims[-1] if aims else self.stop
-
-    @field_validator("stop_aims")
-    @classmethod
-    def _check_order(cls, aims: list[StopAim]) -> list[StopAim]:
-        starts = [aim.after for aim in aims]
-        if starts != sorted(set(starts)) or starts[:1] not in ([], [0]):
-            raise ValueError("must begin after iteration 0, with growing after")
-        return aims
 
     def prune_window(self, iterations: int) -> tuple[int, int]:
         """Return the iteration after which pruning begins, and that of its last change.

@@ -7,6 +7,7 @@ has those of the paper (Kerbl et al. 2023, section 7, and its released code).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -277,24 +278,12 @@ class ModelConfig(_ModelWithApproximations):
         return Approximations.from_values(vars(self))
 
 
-class RateAim(Section):
-    """Target of a falling rate after an iteration."""
-
-    after: Count = Field(ge=0, description="Last iteration before this value applies.")
-    end: Count = Field(ge=1, description="Iteration at which the rate would reach its final value.")
-
-
 class OptimizerConfig(Section):
     """Adam (Kingma and Ba 2015): learning rates per step and its constants."""
 
     means_lr: Rate = Field(3.2e-4, gt=0, description="Initial rate of the means, in scene extents.")
     means_lr_final: Rate = Field(
         3.2e-6, gt=0, description="Final rate of the means; the decay is exponential."
-    )
-    means_lr_aims: list[RateAim] = Field(
-        default_factory=list,
-        description="Ends of the decay after revisions of --budget: a list of "
-        "{after: iteration, end: iteration}; empty: at the last iteration.",
     )
     sh0_lr: Rate = Field(5e-3, ge=0, description="Rate of the degree-0 colour coefficients.")
     shN_lr: Rate = Field(1e-3, ge=0, description="Rate of the higher degrees.")  # noqa: N815
@@ -476,6 +465,12 @@ class FitConfig(Section):
         description="Number of rendered views; each is a step unless optimizer.views_per_step is "
         "set.",
     )
+    stop_after: Count | None = Field(
+        None,
+        ge=1,
+        description="Last iteration, where a clock or a viewer has ended a fit that was planned "
+        "for another number of iterations. null: iterations.",
+    )
     coarse: Resolved[list[CoarseStage]] = Field(
         UNRESOLVED,
         description="Stages of smaller training images, before those of full size: a list of "
@@ -491,6 +486,11 @@ class FitConfig(Section):
     )
 
     @property
+    def last_iteration(self) -> int:
+        """The last iteration that is run; rates and changes are planned for ``iterations``."""
+        return self.iterations if self.stop_after is None else self.stop_after
+
+    @property
     def data_for_training(self) -> DataConfig:
         """``data``, without depth if its loss has no weight."""
         return self.data if self.loss.depth_weight > 0 else self.data_for_rendering
@@ -499,6 +499,26 @@ class FitConfig(Section):
     def data_for_rendering(self) -> DataConfig:
         """``data``, without depth."""
         return self.data.model_copy(update={"ignore_depth": True})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_revised_plan(cls, values: object) -> object:
+        """Read a plan that the clock of an earlier version has revised as its last one, cut."""
+        if not isinstance(values, Mapping):
+            return values
+        values, aims = dict(values), []
+        for section, key in (("optimizer", "means_lr_aims"), ("densify", "stop_aims")):
+            if isinstance(values.get(section), Mapping) and key in values[section]:
+                values[section] = dict(values[section])
+                aims.append(values[section].pop(key))
+        try:
+            if aims and aims[0]:
+                ends = aims[0][-1].get("end", 0), values["iterations"]
+                values |= {"iterations": max(ends), "stop_after": values["iterations"]}
+        except (AttributeError, KeyError, TypeError):
+            got = f"means_lr_aims must be a list of after and end, got {aims[0]}"
+            raise ValueError(f"optimizer.{got}; remove it") from None
+        return values
 
     @model_validator(mode="after")
     def _follow_from_iterations(self) -> FitConfig:
@@ -572,22 +592,15 @@ class FitConfig(Section):
             got = f"{_format_section(before)} before {_format_section(after)}"
             expected = "coarse must be stages with growing until and falling factor"
             _require(is_in_order, expected, got)
-        aims = optimizer.means_lr_aims
-        starts = [aim.after for aim in aims]
-        is_growing = starts == sorted(set(starts)) and all(aim.end > aim.after for aim in aims)
-        got = ", ".join(map(_format_section, aims))
-        _require(is_growing, "optimizer.means_lr_aims must have growing after < end", got)
         _require(self.loss.window % 2 == 1, "loss.window must be odd", self.loss.window)
         return self
 
     def _check_last_phase(self) -> None:
-        """Check that pruning takes place, unless ``--budget`` has revised the plan."""
+        """Check that pruning takes place."""
         prune, n = self.densify.prune, self.iterations
         start = self.densify.prune_window(n)[0]
         expected = f"densify.prune.stop must be > densify.stop and densify.prune.start ({start})"
         _require(prune.stop is None or prune.stop > start, expected, prune.stop)
-        if self.optimizer.means_lr_aims:
-            return
         last = {"densify.stop": self.densify.stop, "densify.prune.start": prune.start or 0}
         for name, iteration in last.items():
             expected = f"{name} must be < iterations ({n}), or there is none left for "

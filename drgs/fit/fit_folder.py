@@ -170,7 +170,7 @@ class FitFolder:
     ) -> FitMetrics:
         known = versions()
         return {
-            "iterations": config.iterations,
+            "iterations": config.last_iteration,
             "num_gaussians": num_gaussians,
             "wall_s": round(wall_s, 2),
             "test": test,

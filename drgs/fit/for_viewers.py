@@ -56,7 +56,7 @@ class ForViewers:
 
 def num_iterations(config: FitConfig) -> int:
     """Return the number of extra iterations."""
-    return math.ceil(ITERATIONS_SHARE * config.iterations)
+    return math.ceil(ITERATIONS_SHARE * config.last_iteration)
 
 
 def for_viewers(
@@ -80,7 +80,7 @@ def for_viewers(
         while tuner.iteration < further.iterations:
             if tuner.step().passes(further.output.history_every):
                 tuner.check_iterations()
-            watch(tuner.iteration - trainer.config.iterations)
+            watch(tuner.iteration - trainer.iteration)
         tuned = tuner.gaussians()
     except UserError as error:  # numbers that are not finite, or too little memory by now
         note = f"the Gaussians for viewers are not fitted any further: {error}"
@@ -104,7 +104,7 @@ def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
 
 def tuning(config: FitConfig) -> FitConfig:
     """Return the configuration of the extra iterations after a fit with ``config``."""
-    before = config.iterations
+    before = config.last_iteration
     total = before + num_iterations(config)
     kept = {"max_gaussians": config.densify.max_gaussians}
     views_per_step = config.optimizer.views_per_step  # which processes may share
@@ -112,6 +112,7 @@ def tuning(config: FitConfig) -> FitConfig:
         **{f"model.{name}": _configured_default(name) for name in DECLARED},
         "model.smoothing": False,
         "iterations": total,
+        "stop_after": None,
         "coarse": [],
         "densify": {"strategy": "adc", "start": 0, "stop": 1, **kept},  # never changes
         "optimizer": {

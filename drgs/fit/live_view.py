@@ -51,17 +51,8 @@ class EarlyStop(StopCriterion):
 
     @override
     def should_continue(self, trainer: Trainer) -> bool:
-        done = trainer.iteration
-        if self._requests.ended and 0 < done < trainer.config.iterations:
-            stop = trainer.config.densify.stop
-            assert stop is not None, "a configuration sets it"
-            trainer.reschedule(done, stop)
-            return False
-        return self._criterion.should_continue(trainer)
-
-    @override
-    def num_iterations(self, trainer: Trainer) -> int:
-        return self._criterion.num_iterations(trainer)
+        is_ended = self._requests.ended and trainer.iteration > 0
+        return not is_ended and self._criterion.should_continue(trainer)
 
 
 class TrainingViewer(Observer):
@@ -72,9 +63,8 @@ class TrainingViewer(Observer):
         requests: RenderRequests,
         page: TrainingPage,
         dataset: Dataset,
-        criterion: StopCriterion,
     ) -> None:
-        self._requests, self._page, self._criterion = requests, page, criterion
+        self._requests, self._page = requests, page
         self._background = dataset.background
         self._scheduler = RenderScheduler(
             requests, page.show, page.refuse, lambda s: max(REFRESH_SECONDS, s / REFRESH_SHARE)
@@ -93,7 +83,7 @@ class TrainingViewer(Observer):
         is_due = self._requests.pending and now - self._progress_at >= PROGRESS_SECONDS
         if history.rows and (is_due or done.is_last):
             self._progress_at = now
-            self._page.show_progress(trainer, history, self._criterion.num_iterations(trainer))
+            self._page.show_progress(trainer, history)
         self._serve(trainer)
         while self._requests.paused and not (self._requests.ended or done.is_last or stops()):
             if not self._serve(trainer):
@@ -138,9 +128,10 @@ class TrainingPage(Page):
         self._room = 0  # range of their x axis, iterations
         self._folder = gui.add_folder("PSNR [dB]")
 
-    def show_progress(self, trainer: Trainer, history: History, total: int) -> None:
-        """Show the progress without synchronizing; total: number of iterations."""
+    def show_progress(self, trainer: Trainer, history: History) -> None:
+        """Show the progress without synchronizing."""
         last, done = history.rows[-1], trainer.iteration
+        total = max(done, trainer.config.last_iteration)  # a clock may end the fit later
         psnr = exponential_mean([row.psnr for row in history.rows])
         self._status.content = (
             f"**{done:,}** of {total:,} iterations, {last.iteration / max(last.wall_s, 1e-9):.1f} "
@@ -149,8 +140,7 @@ class TrainingPage(Page):
         )
         self._bar.value = min(100.0, 100.0 * done / max(total, 1))
         curves = psnr_curves(history.rows)
-        if not self._room / CURVE_ROOM**2 <= total <= self._room:
-            # A budget plan may revise the total twice a second; redraw charts only if needed.
+        if total > self._room:
             self._room = round(CURVE_ROOM * total) if self._charts else total
             self._draw(curves)
         for chart, curve in zip(self._charts, curves, strict=True):
@@ -213,7 +203,7 @@ def watch(
     criterion = EarlyStop(criterion, requests)
     page = TrainingPage(server, requests, start, trainer.config.model.approximations)
     page.add_cameras(dataset.train, visible=True)
-    return TrainingViewer(requests, page, dataset, criterion), criterion
+    return TrainingViewer(requests, page, dataset), criterion
 
 
 def psnr_curves(rows: Sequence[HistoryRow]) -> list[Curve]:

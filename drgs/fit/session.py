@@ -31,7 +31,7 @@ from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.folders import config_for
 from drgs.examine.examination import Examination, examine, show_progress
-from drgs.fit.budget import Budget, Deadline, Plan, plan_fit, rehearse
+from drgs.fit.budget import REHEARSAL_SHARE, Budget, Deadline, Plan, plan_fit, rehearse
 from drgs.fit.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.fit.fingerprint import Fingerprint, fingerprint_of
 from drgs.fit.fit_folder import FitFolder, saved_gaussians
@@ -41,7 +41,6 @@ from drgs.fit.loop import (
     History,
     Iteration,
     Observer,
-    RootDecides,
     StopCriterion,
     iterations,
     smoother,
@@ -68,8 +67,8 @@ if TYPE_CHECKING:  # imported where it is needed
 class ProgressLine(Observer):
     """Draws the progress of a fit: see :class:`drgs.fit.loop.Observer`."""
 
-    def __init__(self, progress: RunProgress, criterion: StopCriterion) -> None:
-        self._progress, self._criterion = progress, criterion
+    def __init__(self, progress: RunProgress) -> None:
+        self._progress = progress
         self._psnr: float | None = None  # dB, smooth
 
     @override
@@ -80,7 +79,8 @@ class ProgressLine(Observer):
             self._psnr = smoother(self._psnr, row.psnr)
             status = f"loss {row.loss:.4f}  PSNR {self._psnr:5.2f} dB  "
             status += f"Gaussians {row.num_gaussians:,}"
-            self._progress.update(row.iteration, self._criterion.num_iterations(trainer), status)
+            total = row.iteration if done.is_last else trainer.config.last_iteration
+            self._progress.update(row.iteration, max(row.iteration, total), status)
 
 
 @dataclass(eq=False)
@@ -135,7 +135,7 @@ class FitSession:
                 if self.examination is not None:
                     folder.write_examination(self.examination)
             if plan is not None:
-                self.criterion = Deadline(self.trainer, plan.end, plan.chosen.curve)
+                self.criterion = Deadline(plan.end, self.comm)
                 if folder is not None and self.budget is not None:
                     folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
             self.on_start(self)
@@ -219,7 +219,8 @@ class FitSession:
     def _plan(self, gaussians: Gaussians, budget: Budget) -> Plan | None:
         """Plan the fit, and make the plan its configuration; None on other ranks than 0."""
         start = self.config, self.dataset, gaussians, self.comm
-        trainer, iteration_s = rehearse(*start, *self._objects)
+        seconds = REHEARSAL_SHARE * budget.seconds
+        trainer, iteration_s = rehearse(*start, *self._objects, seconds=seconds)
         scene = trainer.full_scene()  # gathered from all ranks
         if scene is None:
             return None
@@ -263,16 +264,15 @@ class FitSession:
 
         The state is saved then, and after the last iteration, before results are written.
         """
-        trainer, comm = self.trainer, self.comm
-        criterion, stop = RootDecides(self.criterion, comm), StopRequest()
+        trainer, comm, stop = self.trainer, self.comm, StopRequest()
         with ExitStack() as blocks:
             observers: list[Observer] = [HeldOutQuality(trainer.dataset.test), *self.observers]
             if self.uses_terminal:
-                total = criterion.num_iterations(trainer)
+                total = trainer.config.last_iteration
                 progress = RunProgress("iteration", total, trainer.iteration)
-                observers.insert(0, ProgressLine(blocks.enter_context(progress), criterion))
+                observers.insert(0, ProgressLine(blocks.enter_context(progress)))
                 blocks.enter_context(stop)
-            for done in iterations(trainer, self.history, criterion):
+            for done in iterations(trainer, self.history, self.criterion):
                 self.check_ranges()
                 for observer in observers:
                     observer.after_iteration(trainer, self.history, done, lambda: stop.requested)

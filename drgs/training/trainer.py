@@ -50,7 +50,7 @@ from drgs.training.optimizer import (
 )
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.population import check_shardable, local_gaussians, make_population
-from drgs.training.rates import rates_over_time, revised_plan
+from drgs.training.rates import rates_over_time
 from drgs.training.read_ahead import ReadAhead
 from drgs.training.steps import (
     MAX_TARGET_BYTES,
@@ -195,7 +195,7 @@ class Trainer:
         """Yield the views of the fit from an iteration of ``step`` on."""
         while True:
             yield from (each.view for each in step.views if each.iteration >= iteration)
-            if step.last_iteration >= self.config.iterations:
+            if step.last_iteration >= self.config.last_iteration:
                 break
             step = self.plan(step.last_iteration + 1)
 
@@ -441,7 +441,7 @@ class Trainer:
 
     def warm_start(self, former: Trainer) -> None:
         """Begin after the iterations of another trainer, with the state of its effects."""
-        before, views_per_step = former.config.iterations, former.config.optimizer.views_per_step
+        before, views_per_step = former.iteration, former.config.optimizer.views_per_step
         self.iteration = -(-before // views_per_step) * views_per_step  # a step begins after it
         self._restore_effects({effect.name: effect.state() for effect in former.effects})
 
@@ -450,22 +450,6 @@ class Trainer:
         self.last_step.stage.end()
         self.optimizer.state.clear()
         release_unused_memory()
-
-    def reschedule(self, iterations: int, densify_stop: int) -> None:
-        """Change the last iteration of the fit, and of changes of the population.
-
-        The configuration becomes one which would have given the fit so far. Raises ValueError where
-        there is none.
-        """
-        config, now = self.config, self.iteration
-        if densify_stop != config.densify.stop and now >= min(densify_stop, config.densify.stop):
-            raise ValueError(
-                f"Trainer.reschedule(): densify.stop cannot change from {config.densify.stop} to "
-                f"{densify_stop} after iteration {now}"
-            )
-        self.config = revised_plan(config, now, iterations, densify_stop)
-        self.rates = rates_over_time(self.config, self.extent)
-        self.density = self._density_from(self.density.state())
 
     def state(self) -> dict[str, np.ndarray]:
         """Return everything that the coming iterations depend on, as numpy arrays.

@@ -66,7 +66,7 @@ def viewer_page(monkeypatch):
         screen.show_progress.side_effect = lambda t, *_: t.iteration == 4 and queue.end()
         ask()
         length = EarlyStop(length, queue)
-        return TrainingViewer(queue, screen, dataset, length), length
+        return TrainingViewer(queue, screen, dataset), length
 
     monkeypatch.setattr(training_viewer, "watch", watch)
     return screen

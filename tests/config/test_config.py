@@ -148,8 +148,8 @@ WRONG_VALUES = [
         "factor: 2} before {until: 20, factor: 4}",
     ),
     (
-        "optimizer: {means_lr_aims: [{after: 0, end: 9}, {after: 9, end: 9}]}",
-        "optimizer.means_lr_aims must have growing after < end, got "
+        "optimizer: {means_lr_aims: [9]}",
+        "optimizer.means_lr_aims must be a list of after and end, got "
         "{after: 0, end: 9}, {after: 9, end: 9}",
     ),
     ("densify: {start: 900, stop: 800}", "densify.start must be < densify.stop (800), got 900"),

@@ -48,12 +48,12 @@ def run(trainer, queue=None, dataset=None, before=lambda _: None, stops=lambda: 
     """
     screen, length, history = Mock(progress=[]), StopCriterion(), History()
     screen.show.side_effect = show
-    screen.show_progress.side_effect = lambda trainer, _, total: screen.progress.append(
-        (trainer.iteration, total)
+    screen.show_progress.side_effect = lambda trainer, _: screen.progress.append(
+        (trainer.iteration, trainer.config.last_iteration)
     )
     if queue is not None:
         length = EarlyStop(length, queue)
-        watching = TrainingViewer(queue, screen, dataset, length)
+        watching = TrainingViewer(queue, screen, dataset)
     for done in iterations(trainer, history, length):
         if queue is not None:
             before(done.report.iteration)

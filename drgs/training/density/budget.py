@@ -144,7 +144,7 @@ class GrowthToNumber(DensityStrategy):
         r: what the images' sizes are divided by: coarse images need fewer (DashGaussian, Chen
         et al. 2025). 1 at ``stop``: no change comes after it.
         """
-        start, stop = self.config.start, self.config.stop_at_iteration(iteration)
+        start, stop = self.config.start, self.config.stop
         u = min(max((iteration - start) / max(GROWTH_SHARE * (stop - start), 1), 0), 1)
         size = next((stage.factor for stage in self.coarse if iteration <= stage.until), 1)
         r = size if iteration < stop else 1

@@ -2,8 +2,7 @@
 
 Each iteration, :class:`drgs.training.trainer.Trainer` passes statistics (:class:`StepInfo`) to the
 strategy and lets it act on the rows of the optimizer
-(:class:`drgs.training.optimizer.Population`). Iterations are counted from 1. Where a plan is
-revised, another strategy is made and given :meth:`DensityStrategy.state`.
+(:class:`drgs.training.optimizer.Population`). Iterations are counted from 1.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ ENABLING_SETTINGS = {
 }
 """Further values that make a key or section take effect."""
 
-LISTS = ("coarse", "optimizer.means_lr_aims", "densify.stop_aims")
+LISTS = ("coarse",)
 """Keys whose values are lists of sections."""
 
 

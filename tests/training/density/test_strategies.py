@@ -15,13 +15,10 @@ from support.small_fits import everything_of, steps
 from support.trainers import make_trainer
 
 from drgs.config import extensions
-from drgs.config.density import DensifyConfig
 from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import Gaussians
 from drgs.training import trainer as trainer_module
 from drgs.training.density.strategy import DensityReport, DensityStrategy, Phases, density_strategy
-from drgs.training.rates import revised_stops
-from drgs.training.trainer import Trainer
 
 
 def trainer_with(monkeypatch, strategy, **changes):
@@ -173,42 +170,6 @@ def test_phases_act_as_one_strategy_and_restart_after_row_changes():
     assert phases.refine(None, 5) is None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "densify",
-    [
-        {"strategy": "adc", "adc": {"grad_threshold": 1e-6, "reset_every": 12}},
-        {"strategy": "budget", "budget": {"gaussians": 90, "error_every": 1}},
-    ],
-    ids=lambda densify: densify["strategy"],
-)
-def test_revised_plan_equals_the_same_plan_from_the_start(densify):
-    """Growth ends later, then earlier; with the statistics of the views in between."""
-    densify = {"start": 2, "stop": 20, "every": 4, **densify}
-    revised = make_trainer(densify=densify, iterations=40)
-    for iteration in range(1, 18):
-        revised.step()
-        if iteration in (6, 11):
-            revised.reschedule(45, {6: 36, 11: 16}[iteration])
-    assert revised.num_gaussians > 40
-    again = make_trainer(**revised.config.model_dump())
-    assert everything_of(steps(again, 17)) == everything_of(revised)
-
-
-def test_earlier_stops_of_a_plan_are_kept_for_past_iterations():
-    config = FitConfig(data={"path": "."}, densify={"start": 2, "stop": 20})
-    assert revised_stops(config, 0, 30) == []
-    assert revised_stops(config, 6, 20) == []
-    aims = revised_stops(config, 6, 36)
-    densify = {"start": 2, "stop": 36, "stop_aims": aims}
-    config = FitConfig(data={"path": "."}, densify=densify)
-    assert [config.densify.stop_at_iteration(i) for i in (1, 6, 7, 30)] == [20, 20, 36, 36]
-    assert revised_stops(config, 6, 36) == revised_stops(config, 9, 36) == aims
-    assert revised_stops(config, 6, 9) == [{"after": 0, "stop": 20}, {"after": 6, "stop": 9}]
-    with pytest.raises(ValueError, match="must begin after iteration 0, with growing after"):
-        DensifyConfig(stop_aims=[{"after": 3, "stop": 9}])
-
-
 MODULES = {"adc", "budget", "mcmc", "pruning"}
 
 MCMC = {
@@ -270,45 +231,6 @@ def test_fit_resumes_to_the_same_bytes_from_any_iteration(name, pause):
         assert max(sizes) <= 60
     if name != "mcmc":
         assert sizes[23:] == [20] * 4
-
-
-@pytest.mark.slow
-def test_revised_plan_keeps_a_phase_that_has_begun():
-    trainer = steps(trainer_of("selection", densify__prune__stop=None), 17)
-    assert trainer.config.densify.prune_window(30) == (14, 22)
-    trainer.reschedule(60, 14)
-    assert trainer.config.densify.prune_window(60) == (14, 22)
-    assert steps(trainer, 5).num_gaussians == 20
-    early = steps(trainer_of("selection", densify__prune__stop=24), 5)
-    early.reschedule(60, 30)
-    assert early.config.densify.prune_window(60) == (30, 48)
-
-
-@pytest.mark.slow
-def test_revised_plan_with_a_future_phase_equals_a_plan_from_the_start():
-    """The phase would have begun before the revision, had it been planned so."""
-    window = {"densify__prune__start": 20, "densify__prune__stop": 26}
-    revised = trainer_of("selection", **window)
-    for iteration in range(1, 25):
-        revised.step()
-        if iteration == 18:
-            revised.reschedule(24, 14)
-    assert revised.config.densify.prune_window(24)[0] == 18
-    again = steps(replanned(revised), 24)
-    assert everything_of(again) == everything_of(revised)
-
-
-@pytest.mark.slow
-def test_phase_without_time_is_skipped():
-    trainer = steps(trainer_of("selection", densify__prune__start=20), 16)
-    trainer.reschedule(16, 14)
-    again = steps(replanned(trainer), 16)
-    assert again.num_gaussians == trainer.num_gaussians > 20
-
-
-def replanned(trainer):
-    """A trainer that knows the plan from the start."""
-    return Trainer(trainer.config, fits.plain_dataset(), many_blobs())
 
 
 def test_unused_strategies_are_not_imported(monkeypatch):
