@@ -185,7 +185,7 @@ def room_for_targets(
     if memory.required_bytes > usable:
         raise UserError(_refusal(config, dataset, gaussians, memory, usable, comm.size))
     left = usable - round(1.15 * memory.required_bytes)  # an estimate may be wrong
-    return max(0, min(MAX_TARGET_BYTES, memory.targets, left))
+    return max(0, min(memory.targets, left))
 
 
 def _refusal(

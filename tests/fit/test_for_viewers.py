@@ -71,7 +71,7 @@ def test_refined_cameras_and_colours_are_kept():
 def test_nonfinite_values_fall_back_to_the_closed_form(monkeypatch):
     trainer, _, gaussians = ended_fit(8)
     expected = viewers._closed_form(trainer, gaussians)  # private: what no iteration has changed
-    monkeypatch.setitem(viewers.RATES, "scales_lr", 10.0)
+    monkeypatch.setitem(viewers.TOUCH_UP_RATES, "scales_lr", 10.0)
     monkeypatch.setattr(viewers, "ITERATIONS_SHARE", 0.5)
     step = Trainer.step
 
