@@ -20,7 +20,6 @@ from argparse import ArgumentTypeError
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import mitsuba as mi
@@ -250,7 +249,7 @@ def rehearse(
         config = with_changes(config, {"coarse": [], **still})
     config, dataset = share_inputs(comm, config, dataset)
     objects = deepcopy((density, effects, loss))
-    room = partial(room_for_targets, config, dataset, gaussians, comm)
+    room = room_for_targets(config, dataset, gaussians.num_gaussians, comm)
     trainer = Trainer(config, dataset, gaussians, comm, *objects, room=room)
     views_per_step = config.optimizer.views_per_step
     least = math.ceil(MIN_TIMED_ITERATIONS / views_per_step)

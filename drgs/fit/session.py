@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -176,7 +175,7 @@ class FitSession:
         if self.budget is not None:
             plan = self._plan(gaussians, self.budget)
         self.config, self.dataset = share_inputs(comm, self.config, self.dataset)
-        room = partial(room_for_targets, self.config, self.dataset, gaussians, comm)
+        room = room_for_targets(self.config, self.dataset, gaussians.num_gaussians, comm)
         self.trainer = Trainer(
             self.config, self.dataset, gaussians, comm, *self._objects, room=room
         )

@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import cast
@@ -59,7 +59,6 @@ from drgs.training.steps import (
     StepView,
     ViewGradients,
     ViewLoss,
-    bytes_per_pixel,
     make_stages,
     plan_step,
 )
@@ -106,12 +105,12 @@ class Trainer:
         effects: Sequence[TrainingEffect] = (),
         loss: Loss | None = None,
         *,
-        room: Callable[[int], int] = lambda pixel_bytes: MAX_TARGET_BYTES,
+        room: int = MAX_TARGET_BYTES,
     ) -> None:
         """gaussians: all, on each process; comm: None: this process alone.
 
         density, loss: None: the configured ones; effects: besides the configured ones. room: bytes
-        of targets and uploads that may stay on the device, given those of a pixel.
+        of targets and uploads that may stay on the device.
         """
         config = resolve_defaults(config, dataset)
         views_per_step = config.optimizer.views_per_step
@@ -121,7 +120,6 @@ class Trainer:
         self.effects = training_effects(config, dataset, effects)
         self._given_density, self._given_effects, self._given_loss = density, effects, loss
         self._room = room
-        room_bytes = comm.collective(lambda: room(bytes_per_pixel(self.effects)))
         self.scene = make_scene(
             local_gaussians(gaussians, comm),
             config.model,
@@ -141,7 +139,7 @@ class Trainer:
         )
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)
-        self.stages = make_stages(dataset.train, config, self.effects, room_bytes)
+        self.stages = make_stages(dataset.train, config, self.effects, room)
         self.read_ahead = ReadAhead(dataset.train, views_per_step, comm)
         self.gradients: OneView | SeveralViews = OneView(self.integrator)
         if views_per_step > 1:

@@ -149,8 +149,7 @@ WRONG_VALUES = [
     ),
     (
         "optimizer: {means_lr_aims: [9]}",
-        "optimizer.means_lr_aims must be a list of after and end, got "
-        "{after: 0, end: 9}, {after: 9, end: 9}",
+        "optimizer.means_lr_aims must be a list of after and end, got [9]; remove it",
     ),
     ("densify: {start: 900, stop: 800}", "densify.start must be < densify.stop (800), got 900"),
     (

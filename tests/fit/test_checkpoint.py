@@ -175,8 +175,7 @@ def saved_as(folder, config, change):
 
     data, state = fingerprint_of(make_dataset(1, 1)), {"iteration": np.array(3)}
     save_checkpoint(folder, config, Checkpoint(state, *History().arrays(), 0.0, data))
-    for name in ("config", "config_before"):
-        edit(name, changed)(folder / "checkpoint.npz")
+    edit("config", changed)(folder / "checkpoint.npz")
 
 
 def remove_new_keys(values):
