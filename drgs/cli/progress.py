@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import TextIO
 
 from rich.console import Console
@@ -76,3 +78,19 @@ class RunProgress:
             return ""
         seconds = int((now - started) / max(1, done - first) * (total - done))
         return f"left {seconds // 60}:{seconds % 60:02d}"
+
+
+@contextmanager
+def show_examination() -> Iterator[Callable[[str, int, int], None]]:
+    """Show the progress of an examination on the terminal, within the block."""
+    with ExitStack() as bars:
+        shown: dict[str, RunProgress] = {}
+
+        def show(what: str, done: int, total: int) -> None:
+            if what not in shown:
+                shown[what] = bars.enter_context(RunProgress(f"examines {what}:", total))
+            shown[what].update(done, total)
+            if done == total:
+                bars.close()
+
+        yield show

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     BaseModel,
@@ -24,11 +24,22 @@ from pydantic import (
     model_validator,
 )
 from pydantic.fields import FieldInfo
+from typing_extensions import override
 
 from drgs.config.approximations import DECLARED, Approximations, Declared, Value
-from drgs.config.density import REFERENCE_START, REFERENCE_STOP, DensifyConfig, schedule_of
-from drgs.config.extensions import LossName, ReaderName, Sections
-from drgs.config.section import UNRESOLVED, Count, Rate, Resolved, Section, Weight, subsection
+from drgs.config.density import REFERENCE_START, DensifyConfig
+from drgs.config.extensions import EFFECTS, LOSS_TERMS, LOSSES, READERS, STRATEGIES, section_of
+from drgs.config.section import (
+    UNRESOLVED,
+    Count,
+    ExtensibleSection,
+    Rate,
+    Resolved,
+    Section,
+    Weight,
+    name_of,
+    subsection,
+)
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 
 Color = str | tuple[float, float, float]
@@ -60,8 +71,6 @@ ColorField = Annotated[
 ]
 PathField = Annotated[Path, Field(strict=False)]
 
-CameraRate = Annotated[float, Field(le=1)]  # radians, scene extents, log focal lengths, image sizes
-
 Decay = Annotated[float, Field(ge=0, le=0.999999)]  # float32 has few numbers between this and 1
 
 
@@ -72,7 +81,7 @@ class DataConfig(Section):
     source: str = Field(
         "", description="Source of the data, for the error message if the folder is missing."
     )
-    type: ReaderName = Field(
+    type: Annotated[str, name_of(READERS, "auto")] = Field(
         "auto",
         description="Layout of the folder. auto: by transforms_train.json, transforms.json, or a "
         "COLMAP model in sparse/0, sparse, colmap/sparse/0, dense/0 or beside the photographs.",
@@ -202,6 +211,8 @@ class InitConfig(Section):
 
 class _Model(Section):
     """Fields of :class:`ModelConfig` before the approximations."""
+
+    scaled: ClassVar = ("sh_increase_every",)
 
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
     sh_increase_every: Resolved[Count] = Field(
@@ -343,7 +354,9 @@ class OptimizerConfig(Section):
 class LossConfig(Section):
     """(1 - w) L1 + w (1 - SSIM), in display space."""
 
-    type: LossName = Field("photometric", description="photometric, or the name of an extension.")
+    type: Annotated[str, name_of(LOSSES)] = Field(
+        "photometric", description="photometric, or the name of an extension."
+    )
     dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 disables D-SSIM.")
     window: int = Field(11, ge=3, le=17, description="px: width of SSIM's Gaussian window; odd.")
     sigma: float = Field(
@@ -353,54 +366,6 @@ class LossConfig(Section):
         0.2,
         description="Weight of the mean absolute error of depth, in scene extents, if the data has "
         "depth.",
-    )
-
-
-class ColorConfig(Section):
-    """Exposure and white balance of each training photograph, and each camera's vignetting."""
-
-    lr: Rate | None = Field(
-        None,
-        gt=0,
-        description="Initial rate of the 3 x 4 numbers of each transform, such as 0.02; decays as "
-        "the rate of the means. null: no transforms.",
-    )
-    identity_weight: Weight = Field(
-        1.0, description="Weight of the mean squared difference from the identity."
-    )
-    vignetting_lr: Rate | None = Field(
-        None,
-        gt=0,
-        description="Initial rate of the three coefficients of each camera's vignetting, such as "
-        "0.03. null: no vignetting.",
-    )
-    response_lr: Rate | None = Field(
-        None,
-        gt=0,
-        description="Initial rate of the two numbers by which each camera's response differs from "
-        "the mean of all, such as 0.005. null: the same response.",
-    )
-
-
-class CamerasConfig(Section):
-    """Refinement of the training cameras; rates, for 30,000 iterations, decay as the means'.
-
-    A pose has one step per use of its image: 70 in 7,000 iterations of 100 images.
-    """
-
-    optimise: bool = Field(False, description="Refine poses, focal lengths and principal points.")
-    start: Count = Field(0, ge=0, description="Last iteration before it begins.")
-    rotation_lr: CameraRate = Field(3e-4, ge=0, description="Initial rate of rotations, radians.")
-    translation_lr: CameraRate = Field(
-        3e-4, ge=0, description="Initial rate of translations, scene extents."
-    )
-    focal_lr: CameraRate = Field(
-        0.0, ge=0, description="Initial relative rate of the focal lengths, shared by all views."
-    )
-    principal_lr: CameraRate = Field(
-        0.0,
-        ge=0,
-        description="Initial rate of the principal point, image sizes, shared by all views.",
     )
 
 
@@ -447,16 +412,33 @@ def _format_section(section: BaseModel) -> str:
     return f"{{{', '.join(f'{name}: {value}' for name, value in section)}}}"
 
 
-class FitConfig(Section):
-    """The configuration of a fit."""
+def _read_revised_plan(values: Mapping[Any, object]) -> Mapping[Any, object]:
+    """Read a plan that the clock of an earlier version has revised as its last one, cut."""
+    values, aims = dict(values), []
+    for name, key in (("optimizer", "means_lr_aims"), ("densify", "stop_aims")):
+        if isinstance(section := values.get(name), Mapping) and key in section:
+            values[name] = {k: v for k, v in section.items() if k != key}
+            aims.append(section[key])
+    try:
+        if aims and aims[0]:
+            ends = aims[0][-1].get("end", 0), values["iterations"]
+            values |= {"iterations": max(ends), "stop_after": values["iterations"]}
+    except (AttributeError, KeyError, TypeError):
+        got = f"means_lr_aims must be a list of after and end, got {aims[0]}"
+        raise ValueError(f"optimizer.{got}; remove it") from None
+    return values
+
+
+class FitConfig(ExtensibleSection):
+    """The configuration of a fit; with sections of extensions, under their names."""
+
+    registries: ClassVar = (EFFECTS, LOSSES, LOSS_TERMS, READERS)
 
     data: DataConfig
     init: InitConfig = subsection(InitConfig)
     model: ModelConfig = subsection(ModelConfig)
     optimizer: OptimizerConfig = subsection(OptimizerConfig)
     loss: LossConfig = subsection(LossConfig)
-    colors: ColorConfig = subsection(ColorConfig)
-    cameras: CamerasConfig = subsection(CamerasConfig)
     densify: DensifyConfig = subsection(DensifyConfig)
     output: OutputConfig = subsection(OutputConfig)
     iterations: Count = Field(
@@ -479,11 +461,6 @@ class FitConfig(Section):
         "paper.",
     )
     seed: Count = Field(0, ge=0, description="Seed of all random numbers.")
-    extensions: Sections = Field(
-        default_factory=dict,
-        description="Sections of extensions, by name; a section, even an empty one, activates an "
-        "effect or a loss term.",
-    )
 
     @property
     def last_iteration(self) -> int:
@@ -500,48 +477,47 @@ class FitConfig(Section):
         """``data``, without depth."""
         return self.data.model_copy(update={"ignore_depth": True})
 
-    @model_validator(mode="before")
+    @override
     @classmethod
-    def _read_revised_plan(cls, values: object) -> object:
-        """Read a plan that the clock of an earlier version has revised as its last one, cut."""
-        if not isinstance(values, Mapping):
+    def relocate(cls, values: Mapping[Any, object]) -> Mapping[Any, object]:
+        """Move what earlier versions have elsewhere: ``extensions``, and revised plans."""
+        values = _read_revised_plan(values)
+        sections = values.get("extensions")
+        if not isinstance(sections, Mapping):
             return values
-        values, aims = dict(values), []
-        for section, key in (("optimizer", "means_lr_aims"), ("densify", "stop_aims")):
-            if isinstance(values.get(section), Mapping) and key in values[section]:
-                values[section] = dict(values[section])
-                aims.append(values[section].pop(key))
-        try:
-            if aims and aims[0]:
-                ends = aims[0][-1].get("end", 0), values["iterations"]
-                values |= {"iterations": max(ends), "stop_after": values["iterations"]}
-        except (AttributeError, KeyError, TypeError):
-            got = f"means_lr_aims must be a list of after and end, got {aims[0]}"
-            raise ValueError(f"optimizer.{got}; remove it") from None
+        values = {key: value for key, value in values.items() if key != "extensions"}
+        for name, section in sections.items():
+            place = values
+            if name in STRATEGIES and isinstance(densify := values.get("densify", {}), Mapping):
+                place = values["densify"] = dict(densify)
+            place[name] = section
         return values
 
     @model_validator(mode="after")
     def _follow_from_iterations(self) -> FitConfig:
-        """Resolve the part of the schedule that is not given."""
+        """Resolve the part of the schedule that is not given, and the strategy's section."""
         model, densify, n = self.model, self.densify, self.iterations
         if _is_open(model, "sh_increase_every"):
             every = max(1, min(LATEST_DEGREE, round(DEGREE_SHARE * n)))
             self._complete("model", {"sh_increase_every": every})
-        start_share, stop_share, rate_decay = schedule_of(densify.strategy)
+        extension = STRATEGIES.get(densify.strategy)
+        strategy = extension.value
         if self.optimizer.decay is None:
-            self._complete("optimizer", {"decay": rate_decay})
+            self._complete("optimizer", {"decay": strategy.rate_decay})
         changes, first = {}, densify.start
+        if (section := section_of(extension, densify.sections)) is not None:
+            changes[densify.strategy] = section
         if _is_open(densify, "stop"):
             least = 1 if _is_open(densify, "start") else first + 1
-            most = REFERENCE_STOP if densify.strategy == "adc" else n
-            changes["stop"] = max(least, min(most, round(stop_share * n)))
+            suitable = min(strategy.latest_stop, round(strategy.stop_share * n))
+            changes["stop"] = max(least, suitable)
         if _is_open(densify, "start"):
-            first = max(1, round(start_share * n))
+            first = max(1, round(strategy.start_share * n))
             changes["start"] = min(REFERENCE_START, first, changes.get("stop", densify.stop) // 2)
         self._complete("densify", changes)
         return self
 
-    def _complete(self, section: str, changes: dict[str, float]) -> None:
+    def _complete(self, section: str, changes: dict[str, Any]) -> None:
         """Set values of a section, which is frozen once it is validated."""
         completed = getattr(self, section).model_copy(update=changes)
         object.__setattr__(self, section, completed)
@@ -568,25 +544,12 @@ class FitConfig(Section):
         last = optimizer.means_lr_final
         expected = f"optimizer.means_lr_final must be <= optimizer.means_lr ({optimizer.means_lr})"
         _require(last <= optimizer.means_lr, expected, last)
-        opacity, reset = densify.adc.prune_opacity, densify.adc.reset_opacity
-        expected = f"densify.adc.prune_opacity must be < densify.adc.reset_opacity ({reset})"
-        _require(opacity < reset, f"{expected}, or a reset removes everything", opacity)
-        if self.cameras.optimise:
-            expected = (
-                "model.sh_direction must be mean where cameras.optimise is true (colours along "
-                "rays are not differentiated in the camera)"
-            )
-            is_mean = self.model.sh_direction == "mean"
-            _require(is_mean, expected, self.model.sh_direction)
+        for section in (*densify.sections.values(), *self.sections.values()):
+            if section is not None:
+                section.check(self)
         if densify.prune.to is not None:
             self._check_last_phase()
-        caps = {"densify.max_gaussians": densify.max_gaussians}
-        if densify.strategy == "mcmc" and densify.mcmc.gaussians is not None:
-            caps["densify.mcmc.gaussians"] = densify.mcmc.gaussians
-        for name, cap in caps.items():
-            num_points = init.num_points if init.point_cloud is None else None
-            fits = num_points is None or num_points <= cap
-            _require(fits, f"init.num_points must be <= {name} ({cap})", init.num_points)
+        self.require_room("densify.max_gaussians", densify.max_gaussians)
         for before, after in pairwise(self.coarse or ()):
             is_in_order = before.until < after.until and before.factor > after.factor
             got = f"{_format_section(before)} before {_format_section(after)}"
@@ -594,6 +557,12 @@ class FitConfig(Section):
             _require(is_in_order, expected, got)
         _require(self.loss.window % 2 == 1, "loss.window must be odd", self.loss.window)
         return self
+
+    def require_room(self, key: str, cap: int | None) -> None:
+        """Raise ValueError if more points than ``cap``, the value of a key, are given."""
+        num_points = self.init.num_points if self.init.point_cloud is None else None
+        fits = num_points is None or cap is None or num_points <= cap
+        _require(fits, f"init.num_points must be <= {key} ({cap})", num_points)
 
     def _check_last_phase(self) -> None:
         """Check that pruning takes place."""

@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Optional, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
-from pydantic_core import ErrorDetails
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+from typing_extensions import Self
 
 from drgs.core.constants import MAX_INT
-from drgs.core.errors import one_line
+from drgs.core.errors import did_you_mean, one_line
+from drgs.core.registry import HOW_TO_INSTALL, Extension, Registry, shipped_modules
+
+if TYPE_CHECKING:
+    from drgs.config.schema import FitConfig
 
 Count = Annotated[int, Field(le=MAX_INT)]
 
@@ -32,6 +46,130 @@ class Section(BaseModel):
     """A frozen section without unknown keys, infinities or silent conversions ("3" for 3)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    scaled: ClassVar[tuple[str, ...]] = ()
+    """Names of iterations that keep their share where the number of iterations changes."""
+
+    @property
+    def is_off(self) -> bool:
+        """True if a fit with this section is a fit without it."""
+        return False
+
+    def check(self, config: FitConfig) -> None:
+        """Raise ValueError for values that do not suit others of the configuration."""
+
+
+class ExtensibleSection(Section):
+    """A section that contains sections of extensions, too, under their names."""
+
+    model_config = ConfigDict(extra="allow")
+
+    registries: ClassVar[tuple[Registry, ...]] = ()  # of these extensions
+
+    @property
+    def sections(self) -> Mapping[str, Section | None]:
+        """The sections of extensions by name; None: the extension has no settings."""
+        return self.model_extra or {}
+
+    @classmethod
+    def extension(cls, name: str) -> Extension | None:
+        """Import and return the extension of a section; None: there is none."""
+        shipped = (each for each in cls.registries if name in shipped_modules(each.group))
+        others = (each for each in cls.registries if name in each)
+        registry = next(shipped, None) or next(others, None)
+        return None if registry is None else registry.get(name)
+
+    @classmethod
+    def extensions(cls) -> Iterator[Extension]:
+        """Import and yield the extensions that have settings, or are active by their section."""
+        for registry in cls.registries:
+            yield from (e for e in registry.all() if e.section or not e.is_shipped)
+
+    @classmethod
+    def relocate(cls, values: Mapping[Any, object]) -> Mapping[Any, object]:
+        """Return given values, with the keys of earlier versions replaced."""
+        return values
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _validate_sections(cls, values: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        if not isinstance(values, Mapping):
+            return handler(values)
+        values = cls.relocate(values)
+        own = {k: v for k, v in values.items() if k in cls.model_fields}
+        sections: dict[str, Section | None] = {}
+        errors: list[ErrorDetails] = []
+        for name in values.keys() - own.keys() if len(own) < len(values) else ():
+            try:
+                sections[name] = _validate_section(cls.extension(str(name)), name, values[name])
+            except ValidationError as error:
+                errors += error.errors()
+        try:
+            result = handler(own)
+        except ValidationError as error:
+            errors = [*error.errors(), *errors]
+        if errors:
+            details = [_error_details(error) for error in errors]
+            raise ValidationError.from_exception_data(cls.__name__, details)
+        ordered = {name: sections[name] for name in values if name in sections}
+        assert result.__pydantic_extra__ is not None, "extra is allowed"
+        result.__pydantic_extra__.update(ordered)
+        result.__pydantic_fields_set__.update(ordered)
+        return result
+
+
+def _validate_section(extension: Extension | None, name: str, values: object) -> Section | None:
+    """Return the section ``name`` of an extension, as its model.
+
+    Raises pydantic's ``ValidationError`` with the place of each wrong value.
+    """
+    if extension is None:
+        raise _section_error(name, "extra_forbidden", values)
+    model = extension.section
+    if model is None:
+        if values:
+            raise _section_error(name, "must be empty: it has no settings", values)
+        return None
+    if not issubclass(model, Section):
+        base = f"{Section.__module__}.{Section.__name__}"
+        raise _section_error(name, f"must have a model that is a subclass of {base}", values)
+    if isinstance(values, BaseModel):
+        values = values.model_dump()
+    try:
+        return model.model_validate({} if values is None else values)
+    except ValidationError as error:
+        found = [_error_details({**each, "loc": (name, *each["loc"])}) for each in error.errors()]
+        raise ValidationError.from_exception_data(name, found) from None
+
+
+def _section_error(name: str, problem: str, values: object) -> ValidationError:
+    is_known_type = problem == "extra_forbidden"
+    kind = problem if is_known_type else PydanticCustomError("section", "{text}", {"text": problem})
+    details = InitErrorDetails(type=kind, loc=(name,), input=values)
+    return ValidationError.from_exception_data(name, [details])
+
+
+def _error_details(error: ErrorDetails) -> InitErrorDetails:
+    kind = error["type"]
+    if kind == "section":
+        kind = PydanticCustomError("section", "{text}", {"text": error["msg"]})
+    context = error.get("ctx", {})
+    return InitErrorDetails(type=kind, loc=error["loc"], input=error["input"], ctx=context)
+
+
+def name_of(registry: Registry, *others: str) -> AfterValidator:
+    """Return a validator of an extension's name; others: words that are no extension's."""
+
+    def check(name: str) -> str:
+        if name not in others and name not in registry:
+            known = [*others, *registry.names()]
+            quoted = ", ".join(f"'{each}'" for each in known)
+            raise ValueError(
+                f"must be one of {quoted}{did_you_mean(name, known)} ({HOW_TO_INSTALL})"
+            )
+        return name
+
+    return AfterValidator(check)
 
 
 SectionType = TypeVar("SectionType", bound=Section)
@@ -61,6 +199,8 @@ def expectation(error: ErrorDetails) -> str:
     kind, context = error["type"], error.get("ctx", {})
     if kind == "value_error":
         return str(context["error"])
+    if kind == "section":
+        return error["msg"]
     for relation, sign in _RELATIONS.items():
         if relation in context:
             return f"must be {sign} {context[relation]:.10g}"

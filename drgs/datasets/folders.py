@@ -78,7 +78,7 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
     """
     overrides, where = list(overrides), str(folder)
     given = config_from({"data": {"path": folder}}, where, overrides)
-    layout, reader = find_reader(given.data, given.extensions)
+    layout, reader = find_reader(given.data, given.sections)
     sizes = [image_size(file) for file in reader.image_files(given.data)]
     width, height = max(sizes, key=lambda size: (math.prod(size), size[1]))
     data = {"path": folder, "type": layout, "image_size": _max_width(width, height, sizes)}

@@ -11,12 +11,13 @@ from collections.abc import Sequence
 
 from drgs.cli.commands import CommandParser, file_or_folder, run_command
 from drgs.cli.execution import add_execution_arguments, execution_settings, select_variant
+from drgs.cli.progress import show_examination
 from drgs.config.load import load_config
 from drgs.config.section import format_value
 from drgs.core.environment import VARIANTS
 from drgs.datasets import load_dataset
 from drgs.datasets.folders import config_for
-from drgs.examine.examination import examine, show_progress
+from drgs.examine.examination import examine
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -49,10 +50,10 @@ def run(args: argparse.Namespace) -> None:
     else:
         config = load_config(args.config, args.overrides)
     with execution_settings(args.threads, args.debug):
-        dataset = load_dataset(config.data_for_training, sections=config.extensions)
+        dataset = load_dataset(config.data_for_training, sections=config.sections)
         print(dataset.description)
         select_variant(args.variant or VARIANTS[0])
-        with show_progress() as progress:
+        with show_examination() as progress:
             examination = examine(dataset, config, progress)
     print(examination)
     if changes := examination.changes:

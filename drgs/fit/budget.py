@@ -31,13 +31,13 @@ from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.datasets.types import Dataset
+from drgs.effects.base import TrainingEffect
 from drgs.fit.inputs import share_inputs
 from drgs.fit.loop import StopCriterion
 from drgs.fit.memory import room_for_targets
 from drgs.fit.report import seconds_of_curves, seconds_of_results
 from drgs.gaussians.parameters import Gaussians
 from drgs.training.density.strategy import DensityStrategy
-from drgs.training.effects.base import TrainingEffect
 from drgs.training.losses import Loss
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import Trainer

@@ -15,14 +15,14 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.config.approximations import Approximations
-from drgs.config.changes import with_changes
+from drgs.config.changes import given_keys, with_changes
 from drgs.config.schema import FitConfig
 from drgs.core.environment import processor
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
 from drgs.core.folders import sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
-from drgs.examine.examination import Examination, given_keys
+from drgs.effects.base import Examination
 from drgs.fit.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.fit.inputs import versions
 from drgs.fit.loop import History

@@ -23,12 +23,12 @@ from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import View
+from drgs.effects.base import TrainingEffect
+from drgs.effects.colors import colors_of
 from drgs.effects.smoothing import bake_for_viewers, bake_smoothing
 from drgs.fit.inputs import share_gaussians
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.training.effects.base import TrainingEffect
 from drgs.training.rates import TOUCH_UP_RATES
 from drgs.training.trainer import Trainer
 
@@ -93,12 +93,9 @@ def for_viewers(
 
 def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
     """Return Gaussians in closed form, by the training cameras as the fit has them."""
-    states = (
-        read_sensor(sensor, trainer.integrator.near) for sensor in trainer.fit_state().sensors()
-    )
     on_device = bake_smoothing(gaussians).to(mi.TensorXf)
     with dr.suspend_grad():
-        cameras = map(camera_from_sensor, states)
+        cameras = trainer.fit_state().cameras()
         return bake_for_viewers(on_device, cameras, trainer.config.model.approximations)
 
 
@@ -123,7 +120,7 @@ def tuning(config: FitConfig) -> FitConfig:
         **{f"cameras.{name}_lr": 0.0 for name in ("rotation", "translation", "focal", "principal")},
     }
     for name in ("lr", "vignetting_lr", "response_lr"):
-        if getattr(config.colors, name) is not None:
+        if getattr(colors_of(config), name) is not None:
             changes[f"colors.{name}"] = NEGLIGIBLE_RATE
     return with_changes(config, changes)
 

@@ -19,8 +19,9 @@ from typing_extensions import override
 
 from drgs.cli.ending import StopRequest
 from drgs.cli.execution import select_variant
-from drgs.cli.progress import RunProgress
+from drgs.cli.progress import RunProgress, show_examination
 from drgs.config.changes import with_changes
+from drgs.config.extensions import EXAMINERS
 from drgs.config.load import config_from, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
@@ -29,7 +30,7 @@ from drgs.core.memory import release_unused_memory
 from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.folders import config_for
-from drgs.examine.examination import Examination, examine, show_progress
+from drgs.effects.base import Examination, Examiner, TrainingEffect
 from drgs.fit.budget import REHEARSAL_SHARE, Budget, Deadline, Plan, plan_fit, rehearse
 from drgs.fit.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.fit.fingerprint import Fingerprint, fingerprint_of
@@ -53,7 +54,6 @@ from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import format_effects
 from drgs.results.history import HistoryRow
 from drgs.training.density.strategy import DensityStrategy
-from drgs.training.effects.base import TrainingEffect
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.losses import Loss
 from drgs.training.parallel.communicator import Communicator
@@ -193,7 +193,7 @@ class FitSession:
         if checkpoint is not None and checkpoint.config is not None:
             config = checkpoint.config
         if self.dataset is None:
-            self.dataset = load_dataset(config.data_for_training, sections=config.extensions)
+            self.dataset = load_dataset(config.data_for_training, sections=config.sections)
         if folder is not None:
             self._fingerprint = fingerprint_of(self.dataset)
             if checkpoint is not None:
@@ -205,14 +205,18 @@ class FitSession:
     def _examine(self, given: FitConfig) -> None:
         """Choose the effects that the photographs call for; given: not completed."""
         _, dataset = self._inputs
-        with show_progress() if self.uses_terminal else nullcontext() as progress:
+        if not (names := EXAMINERS.names()):
+            self._print("not examined: no examiner is installed")
+            return
+        examine: Examiner = EXAMINERS.get(names[0]).value
+        with show_examination() if self.uses_terminal else nullcontext() as progress:
             self.examination = examine(dataset, given, progress)
         self._print(str(self.examination))
         changes = self.examination.changes
         if changes:
             given = with_changes(given, changes)
         if "data.background" in changes:
-            self.dataset = load_dataset(given.data_for_training, sections=given.extensions)
+            self.dataset = load_dataset(given.data_for_training, sections=given.sections)
         self.config = resolve_defaults(given, self._inputs[1])
 
     def _plan(self, gaussians: Gaussians, budget: Budget) -> Plan | None:

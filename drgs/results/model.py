@@ -23,6 +23,7 @@ from drgs.core.errors import PluginError, UserError, format_names
 from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets import Dataset, load_dataset
+from drgs.effects.cameras import CAMERAS, cameras_of
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import (
@@ -36,7 +37,7 @@ from drgs.integrator.state import SplatsState
 from drgs.integrator.summary import format_effects, summary_of_views
 from drgs.integrator.types import is_splats
 from drgs.io.images import write_png
-from drgs.results.files import CAMERAS, CONFIG, ERROR_BUDGET, GAUSSIANS
+from drgs.results.files import CONFIG, ERROR_BUDGET, GAUSSIANS
 from drgs.results.folder import relocate_data
 from drgs.results.refined_cameras import refined_dataset
 
@@ -179,11 +180,11 @@ class Model:
             raise UserError(
                 f"{option}: needs photographs: give the configuration of a fit (--scene CONFIG.yml)"
             )
-        dataset = load_dataset(self.config.data_for_rendering, sections=self.config.extensions)
+        dataset = load_dataset(self.config.data_for_rendering, sections=self.config.sections)
         dataset = dataset.relative_to(self.gaussians.origin)
         if self.folder is None or not (path := self.folder / CAMERAS).is_file():
             return dataset
-        if not self.config.cameras.optimise:
+        if not cameras_of(self.config).optimise:
             print(
                 f"cameras: as the dataset has them; those of {path} are used with "
                 "--set cameras.optimise=true"
@@ -254,5 +255,5 @@ def load_open_config(
     if not is_open(config):
         return config
     return resolve_defaults(
-        config, load_dataset(config.data_for_rendering, sections=config.extensions)
+        config, load_dataset(config.data_for_rendering, sections=config.sections)
     )

@@ -8,9 +8,9 @@ from itertools import islice
 
 from drgs.datasets.storage import is_on_disk
 from drgs.datasets.types import View
-from drgs.training.effects.base import TrainingView
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.population import own_views
+from drgs.training.views import TrainingView
 
 NUM_AHEAD = 2  # views besides that of the iteration
 

@@ -18,11 +18,12 @@ from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
 from drgs.datasets.images import shift_pixels, smaller_view
 from drgs.datasets.storage import is_on_disk
 from drgs.datasets.types import View
+from drgs.effects.base import TrainingEffect
 from drgs.integrator.scene import make_sensors
 from drgs.integrator.types import SplatsPlugin
-from drgs.training.effects.base import TrainingEffect, TrainingView
 from drgs.training.losses import TARGET_BYTES
 from drgs.training.rates import LearningRates
+from drgs.training.views import TrainingView
 
 MAX_TARGET_BYTES = 2 << 30
 """Most memory of targets and effects' uploads that stay on the device until their view is drawn

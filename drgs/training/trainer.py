@@ -18,9 +18,16 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.config.schema import FitConfig
+from drgs.core.adam import (
+    make_optimizer,
+    optimizer_state,
+    pending_gradients,
+    restore_optimizer,
+)
 from drgs.core.memory import release_unused_memory
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
+from drgs.effects.base import TrainingEffect, integrator_settings, training_effects
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
@@ -33,21 +40,8 @@ from drgs.training.density.strategy import (
     StepInfo,
     density_strategy,
 )
-from drgs.training.effects.base import (
-    FitState,
-    TrainingEffect,
-    TrainingView,
-    integrator_settings,
-    training_effects,
-)
 from drgs.training.finite_checks import GradientWatch, WatchedIteration, check_values
 from drgs.training.losses import Loss, make_loss, make_loss_terms
-from drgs.training.optimizer import (
-    make_optimizer,
-    optimizer_state,
-    pending_gradients,
-    restore_optimizer,
-)
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.population import check_shardable, local_gaussians, make_population
 from drgs.training.rates import rates_over_time
@@ -62,6 +56,7 @@ from drgs.training.steps import (
     make_stages,
     plan_step,
 )
+from drgs.training.views import FitState, TrainingView
 
 DENSITY = "density/"  # precedes the names of the strategy's state
 

@@ -9,6 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from drgs.training.effects.base import TrainingEffect
+from drgs.training.findings import Finding, exposure_spread
 from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 from support.commands import assert_ends_well, assert_refused
@@ -21,8 +23,6 @@ from drgs.config.load import config_from
 from drgs.core.registry import temporary_registrations
 from drgs.examine import __main__ as command
 from drgs.examine.examination import Examination, decide, given_keys, overlaps, split_views
-from drgs.training.effects.base import TrainingEffect
-from drgs.training.findings import Finding, exposure_spread
 
 ITERATIONS = 1500  # of a fit: the fewest that are examined
 NAMES = ["background of one colour", "exposure and white balance", "camera refinement"]

@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
+from drgs.training.effects.base import TrainingEffect
 from support.fit_command import VALUES, write_project
 from support.folders import contents
 from support.small_capture import make_dataset, write_dataset
@@ -17,7 +18,6 @@ from drgs.fit import fit_folder
 from drgs.fit.budget import rehearse
 from drgs.fit.session import FitSession
 from drgs.training.density.strategy import DensityReport, DensityStrategy
-from drgs.training.effects.base import TrainingEffect
 from drgs.training.losses import Loss
 
 

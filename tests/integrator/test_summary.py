@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import TESTS
+from drgs.training.effects.base import integrator_settings, training_effects
 from support import small_fits as fits
 from support.viewer_rendering import VIEWER_RENDERING
 from support.views import VIEWS, Scene, tensors
@@ -20,7 +21,6 @@ from drgs.config.schema import FitConfig
 from drgs.fit.summary import summary_of_fit
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import format_effects, summary_of_sensors, summary_of_views
-from drgs.training.effects.base import integrator_settings, training_effects
 
 MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",

@@ -9,6 +9,7 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from drgs.training.effects.base import TrainingEffect
 
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
@@ -19,7 +20,6 @@ from drgs.integrator.scene import render_views
 from drgs.io.images import to_uint8
 from drgs.reference import splatting as reference
 from drgs.results.metrics import ssim
-from drgs.training.effects.base import TrainingEffect
 from drgs.training.trainer import Trainer
 from support import small_capture as capture
 from support.helpers import NEAR_THRESHOLD

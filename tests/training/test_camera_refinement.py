@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from drgs.training.effects.cameras import INTRINSICS
 from scipy.spatial.transform import Rotation
 from support import small_fits as fits
 from support.helpers import central_difference, single
@@ -23,7 +24,6 @@ from drgs.datasets.images import smaller_view
 from drgs.integrator.scene import render_views
 from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import refined_dataset
-from drgs.training.effects.cameras import INTRINSICS
 
 
 def make_trainer(dataset=None, gaussians=None, **changes):

@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from drgs.training.effects.base import training_effects
 from support import small_fits as fits
 from support.installed_examples import installed_examples
 
@@ -14,7 +15,6 @@ from drgs.core.errors import UserError
 from drgs.fit.__main__ import add_arguments
 from drgs.fit.summary import summary_of_fit
 from drgs.integrator.summary import format_effects
-from drgs.training.effects.base import training_effects
 from drgs.training.losses import prepare_target
 
 

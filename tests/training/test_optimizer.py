@@ -7,9 +7,9 @@ from drjit.llvm.ad import Float, TensorXf, UInt32
 from drjit.opt import Adam
 from support.populations import rows_of
 
+from drgs.core.adam import LARGE_WIDTH, make_optimizer
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.training import optimizer as optimizer_module
-from drgs.training.optimizer import LARGE_WIDTH, make_optimizer
 
 RATES = {name: 0.01 * (k + 1) for k, name in enumerate(PARAMETER_NAMES)}
 

@@ -9,7 +9,6 @@ import drjit as dr
 import numpy as np
 from typing_extensions import override
 
-from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.types import Float, TensorXf
@@ -65,7 +64,6 @@ class Pruning(DensityStrategy):
         return round(before * (self.to / before) ** share)
 
 
-@STRATEGIES.register("importance")
 class Importance(Pruning):
     """Removes Gaussians by their contribution to images.
 
@@ -119,7 +117,6 @@ class Importance(Pruning):
         self.scores = from_host(type(self.scores), state["weights"])
 
 
-@STRATEGIES.register("selection")
 class NaturalSelection(Pruning):
     """Lowers all opacities, and removes Gaussians that become transparent.
 
@@ -172,6 +169,10 @@ class NaturalSelection(Pruning):
     @override
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         self.num_before, self.num_left = int(state["pruned_from"]), int(state["pruned_to"])
+
+
+METHODS = {"importance": Importance, "selection": NaturalSelection}
+"""By the value of ``densify.prune.method``."""
 
 
 def best_rows(scores: np.ndarray, count: int) -> np.ndarray:

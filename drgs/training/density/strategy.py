@@ -7,6 +7,7 @@ strategy and lets it act on the rows of the optimizer
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain
@@ -16,7 +17,6 @@ import drjit as dr
 import numpy as np
 from typing_extensions import override
 
-from drgs.config.density import DEFAULT_SCHEDULE
 from drgs.config.extensions import STRATEGIES, section_of
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
@@ -102,9 +102,12 @@ class DensityStrategy(Protocol):
 
     by_row: Sequence[str] = ()  # names in :meth:`state` of arrays with a row for each Gaussian
 
-    start_share, stop_share, rate_decay = DEFAULT_SCHEDULE
-    """Shares of the iterations, for schedules that are not given: ``densify.start`` is at most the
-    first (and half of stop), ``densify.stop`` at most the second; and ``optimizer.decay``."""
+    start_share, stop_share, latest_stop = 1 / 20, 1 / 2, math.inf
+    """For schedules that are not given: shares of the iterations that are at most ``densify.start``
+    (which is at most half of stop, too) and ``densify.stop``, and the latest iteration of it."""
+
+    rate_decay = 0.1  # ``optimizer.decay`` that is not given
+    begins_coarse = True  # whether ``coarse`` that is not given may be other than empty
 
     def begin(self, population: Population) -> None:
         """Reset the statistics: at the start, and after changes by other strategies."""
@@ -174,17 +177,20 @@ def density_strategy(
     dataset: None for an estimate; growth: a strategy instead of ``densify.strategy``.
     """
 
-    def make(name: str) -> DensityStrategy:
-        strategy = STRATEGIES.get(name, "densify.strategy")
-        section = section_of(strategy, config.extensions)
-        return strategy.value.from_config(config, dataset, section)
-
-    growth = make(config.densify.strategy) if growth is None else growth
+    densify = config.densify
+    if growth is None:
+        strategy = STRATEGIES.get(densify.strategy, "densify.strategy")
+        section = section_of(strategy, densify.sections)
+        growth = strategy.value.from_config(config, dataset, section)
     phases = [growth]
-    if config.densify.remove_floaters:
-        phases.append(make("floaters"))
-    if config.densify.prune.to is not None:
-        phases.append(make(config.densify.prune.method))
+    if densify.remove_floaters:
+        from drgs.training.density.floaters import Floaters
+
+        phases.append(Floaters.from_config(config, dataset, None))
+    if densify.prune.to is not None:
+        from drgs.training.density.pruning import METHODS
+
+        phases.append(METHODS[densify.prune.method].from_config(config, dataset, None))
     return growth if len(phases) == 1 else Phases(phases)
 
 

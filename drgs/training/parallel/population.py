@@ -17,11 +17,12 @@ import numpy as np
 from typing_extensions import override
 
 from drgs.config.schema import FitConfig
+from drgs.core.adam import LeanAdam
 from drgs.core.arrays import from_host
 from drgs.core.errors import UserError
 from drgs.core.types import Float, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.training.optimizer import LeanAdam, Population
+from drgs.training.optimizer import Population
 from drgs.training.parallel.communicator import Communicator
 
 

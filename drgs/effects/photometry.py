@@ -13,9 +13,9 @@ camera has none. The background behind a transparent photograph is unchanged.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -24,16 +24,21 @@ from drjit.opt import Adam
 from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
-from drgs.config.schema import ColorConfig, FitConfig
 from drgs.core.errors import UserError
-from drgs.core.files import atomic_path
+from drgs.core.files import write_json
 from drgs.core.types import Float, TensorXf
-from drgs.datasets.types import Dataset, View
-from drgs.results.files import PHOTOMETRY
-from drgs.training.effects.base import FitState, TrainingView, as_tensor, opacity_of
-from drgs.training.effects.view_parameters import CenteredEffect
+from drgs.effects.base import SimulatedEffect, as_tensor, opacity_of
+from drgs.effects.colors import ColorConfig, colors_of
+from drgs.effects.optimised import CenteredEffect
+
+if TYPE_CHECKING:
+    from drgs.config.schema import FitConfig
+    from drgs.datasets.types import Dataset, View
+    from drgs.training.views import FitState, TrainingView
 
 DARKEST = 1e-3  # of colours that f maps; below, and above 1, it is linear
+
+PHOTOMETRY = "photometry.json"  # vignetting and response of the training views' cameras
 
 COEFFICIENTS = {"vignetting": 3, "response": 2}
 
@@ -42,13 +47,25 @@ COEFFICIENTS = {"vignetting": 3, "response": 2}
 class Photometry(CenteredEffect):
     """Coefficients of vignetting and response, a row for each camera."""
 
-    name, centered = "photometry", "response"
+    order, centered = 20, "response"
     upload_bytes = 24
+    files = (PHOTOMETRY,)
+
+    @classmethod
+    @override
+    def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
+        return bool(given_rates(colors_of(config)))
+
+    @classmethod
+    @override
+    def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
+        names = given_rates(colors_of(config))
+        return [SimulatedEffect(n, "of each camera", f"colors.{n}_lr") for n in names]
 
     @classmethod
     @override
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> Photometry:
-        return cls(config.colors, dataset.train)
+        return cls(colors_of(config), dataset.train)
 
     def __init__(self, config: ColorConfig, views: Sequence[View]) -> None:
         """views: the training split."""
@@ -60,8 +77,7 @@ class Photometry(CenteredEffect):
                 "colors.response_lr: needs photographs by several cameras, whose size, intrinsics "
                 "or lens differ, got those of one; leave it out"
             )
-        given = {"vignetting": config.vignetting_lr, "response": config.response_lr}
-        rates = {name: rate for name, rate in given.items() if rate is not None}
+        rates = given_rates(config)
         super().__init__({n: np.zeros((len(rows), COEFFICIENTS[n])) for n in rates}, rates)
         self.attached: dict[int, dict[str, Float]] = {}  # by view, which may share a camera
 
@@ -121,13 +137,18 @@ class Photometry(CenteredEffect):
             view.name: {name: values[row].tolist() for name, values in found.items()}
             for view, row in zip(dataset.train, self.camera_rows, strict=True)
         }
-        with atomic_path(folder / PHOTOMETRY) as temporary:
-            temporary.write_text(json.dumps(by_view, indent=1) + "\n")
+        write_json(folder / PHOTOMETRY, by_view)
 
     @override
     def _optimizers_of(self, view: TrainingView) -> dict[str, Adam]:
         row = self.camera_rows[view.index]
         return {name: optimizers[row] for name, optimizers in self.optimizers.items()}
+
+
+def given_rates(config: ColorConfig) -> dict[str, float]:
+    """Return the rates of the coefficients that a fit has."""
+    rates = {"vignetting": config.vignetting_lr, "response": config.response_lr}
+    return {name: rate for name, rate in rates.items() if rate is not None}
 
 
 def _camera_key(view: View) -> tuple[object, ...]:
