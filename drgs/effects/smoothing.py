@@ -119,7 +119,7 @@ class TrainingSmoothing(TrainingEffect):
     @override
     def begin(self, fit: FitState) -> None:
         is_due = any(iteration % UPDATE_EVERY == 1 for iteration in fit.iterations_of_step)
-        if self.filter is None or fit.begins_stage or is_due:
+        if self.filter is None or fit.begins_phase or is_due:
             self.filter = smoothing_of(fit.means, fit.cameras())
         fit.integrator.smoothing = self.filter
 

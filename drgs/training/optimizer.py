@@ -70,7 +70,7 @@ class Population:
         """Return a number 0 for each row of this process: Float."""
         return dr.zeros(type(self.value("means").array), self.num_local_rows)
 
-    def rows(self, numbers: np.ndarray) -> UInt32:
+    def to_device_indices(self, numbers: np.ndarray) -> UInt32:
         """Return row numbers, (M,) integers on the host, as ``UInt32`` on the device."""
         return from_host(self._index_type, numbers.astype(np.uint32))
 

@@ -1,14 +1,15 @@
-"""Stages and steps of a fit: the views of an iteration, their size, and their gradients.
+"""Steps of a fit: the views of an iteration, their size, and their gradients.
 
-A stage trains on images of one size. A step ends with one change of the Gaussians.
+A phase trains on images of one size. A step ends with one change of the Gaussians.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, islice
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from drgs.effects.base import TrainingEffect
 from drgs.integrator.scene import make_sensors
 from drgs.integrator.types import SplatsPlugin
 from drgs.training.losses import TARGET_BYTES
+from drgs.training.parallel.communicator import Communicator
+from drgs.training.parallel.population import own_views
 from drgs.training.rates import LearningRates
 from drgs.training.views import TrainingView
 
@@ -32,7 +35,7 @@ the file has four times the pixels."""
 
 
 @dataclass(eq=False)
-class Stage:
+class ResolutionPhase:
     """Iterations that train on images of one size."""
 
     until: float  # last iteration
@@ -66,16 +69,16 @@ class Stage:
             self.kept.add(view)
 
     def end(self) -> None:
-        """Free kept targets and uploads: the stage is over."""
+        """Free kept targets and uploads: the phase is over."""
         for view in self.kept:
             view.free()
         self.kept.clear()
 
 
-def make_stages(
+def make_phases(
     views: tuple[View, ...], config: FitConfig, effects: Sequence[TrainingEffect], room: int
-) -> list[Stage]:
-    """Return the configuration's coarse stages, and the last one with full images.
+) -> list[ResolutionPhase]:
+    """Return the phases of the configuration: coarse ones, and the last one with full images.
 
     room: bytes of targets and uploads that may stay on the device. None do where photographs are
     on disk: what is read ahead costs no time.
@@ -84,7 +87,7 @@ def make_stages(
     sizes = [(s.until, [smaller_view(v, s.factor) for v in views]) for s in config.coarse]
     is_refined = any(effect.moves_sensors for effect in effects)
     window = config.loss.window, config.loss.sigma
-    stages = []
+    phases = []
     for until, resized in [*sizes, (math.inf, views)]:
         shifted = [(view,) if is_refined else shift_pixels(view) for view in resized]
         sensors = iter(make_sensors(list(chain(*shifted)), calibrated=is_refined))
@@ -92,8 +95,28 @@ def make_stages(
             [TrainingView(view, index, next(sensors), effects, window) for view in views_of_one]
             for index, views_of_one in enumerate(shifted)
         ]
-        stages.append(Stage(until, training_views, bytes_per_pixel(effects), room))
-    return stages
+        phases.append(ResolutionPhase(until, training_views, bytes_per_pixel(effects), room))
+    return phases
+
+
+NUM_AHEAD = 2  # views that are read besides that of the iteration
+
+
+class ReadAhead:
+    """Reads the next photographs that a process renders, if they are on disk, in a thread."""
+
+    def __init__(self, views: Sequence[View], views_per_step: int, comm: Communicator) -> None:
+        """views: the training views."""
+        own = own_views(len(views), views_per_step, comm.rank, comm.size)
+        self._own = {index for index in own if is_on_disk(views[index])}
+        self._thread = ThreadPoolExecutor(1, "read-ahead")  # starts with its first task
+
+    def __call__(self, coming: Iterable[TrainingView]) -> None:
+        """Start to read the first of the coming views; an error is raised where one is used."""
+        if self._own:
+            own = (view for view in coming if view.index in self._own)
+            for view in islice(own, 1 + NUM_AHEAD):
+                view.read_ahead(self._thread)
 
 
 def bytes_per_pixel(effects: Sequence[TrainingEffect]) -> int:
@@ -115,8 +138,8 @@ class Step:
     """The iterations between two changes of the Gaussians, one for each view."""
 
     iterations: range
-    stage: Stage  # of the image size that is in use
-    begins_stage: bool
+    phase: ResolutionPhase  # of the image size that is in use
+    begins_phase: bool
     views: tuple[StepView, ...]  # by iteration
     num_averaged: int  # batch size
     is_update: bool  # whether the optimizer steps at its end
@@ -128,23 +151,23 @@ class Step:
 
 
 def plan_step(
-    iteration: int, config: FitConfig, rates: LearningRates, stages: Sequence[Stage]
+    iteration: int, config: FitConfig, rates: LearningRates, phases: Sequence[ResolutionPhase]
 ) -> Step:
     """Return the step that an iteration is part of; iteration 0 is the start of a fit."""
     views_per_step = config.optimizer.views_per_step
     iterations = step_of(iteration, views_per_step, config.iterations)
     first, last = iterations[0], iterations[-1]
-    stage = next(stage for stage in stages if first <= stage.until)
+    phase = next(phase for phase in phases if first <= phase.until)
     is_late = rates.means.progress(first) > config.optimizer.views_from
     is_settled = first >= config.densify.first_fixed_iteration(config.iterations)
     late_views = config.optimizer.views if is_late and is_settled else 1
-    order = len(stage.shifted), config.seed, views_per_step
+    order = len(phase.shifted), config.seed, views_per_step
     return Step(
         iterations=iterations,
-        stage=stage,
-        begins_stage=any(first - views_per_step <= each.until < first for each in stages),
+        phase=phase,
+        begins_phase=any(first - views_per_step <= each.until < first for each in phases),
         views=tuple(
-            StepView(i, i - first, stage.view(view_of(i, *order), i)) for i in iterations if i > 0
+            StepView(i, i - first, phase.view(view_of(i, *order), i)) for i in iterations if i > 0
         ),
         num_averaged=max(late_views, len(iterations)),
         is_update=late_views <= views_per_step or last % late_views == 0,

@@ -45,15 +45,15 @@ from drgs.training.losses import Loss, make_loss, make_loss_terms
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.population import check_shardable, local_gaussians, make_population
 from drgs.training.rates import rates_over_time
-from drgs.training.read_ahead import ReadAhead
 from drgs.training.steps import (
     MAX_TARGET_BYTES,
     OneView,
+    ReadAhead,
     Step,
     StepView,
     ViewGradients,
     ViewLoss,
-    make_stages,
+    make_phases,
     plan_step,
 )
 from drgs.training.views import FitState, TrainingView
@@ -134,7 +134,7 @@ class Trainer:
         )
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)
-        self.stages = make_stages(dataset.train, config, self.effects, room)
+        self.phases = make_phases(dataset.train, config, self.effects, room)
         self.read_ahead = ReadAhead(dataset.train, views_per_step, comm)
         self.gradients: OneView | SeveralViews = OneView(self.integrator)
         if views_per_step > 1:
@@ -152,10 +152,17 @@ class Trainer:
     def step(self) -> StepReport:
         """Render the views of a step, one per iteration, and step along their mean gradient."""
         step = self._begin_step()
+        self.params.update(self.optimizer)
+        self._begin_effects(step)
         penalties = self._differentiate_penalties(step)
         losses: dict[int, ViewLoss] = {}
         for view in self.gradients.own_views():
-            losses[view.place] = self._differentiate(step, view)
+            self._begin_view(step, view)
+            rendered = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
+            image, loss, error = self.compare(cast(TensorXf, rendered), view.view)
+            dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
+            self._end_view(view, dr.detach(image))
+            losses[view.place] = ViewLoss(dr.detach(loss), error, view.view.counted_share)
         gradients = self.gradients.finish([tuple(self._pixel_weights(i)) for i in step.iterations])
         views = self._total_losses(step, gradients, losses, penalties)
         if step.is_update:
@@ -164,25 +171,45 @@ class Trainer:
         self._update_effects(step)
         report = self._control_density(step, gradients)
         for place in losses:
-            step.stage.keep_or_free(step.views[place].view)
+            step.phase.keep_or_free(step.views[place].view)
         means_lr = self.rates.means(step.last_iteration)
         return StepReport(step.last_iteration, self.num_gaussians, means_lr, report, tuple(views))
 
-    def _differentiate(self, step: Step, view: StepView) -> ViewLoss:
-        """Render a view, and add the derivatives of its loss to the step's."""
+    def _begin_step(self) -> Step:
+        """Plan the next step."""
+        before, step = self.last_step, self.plan(self.iteration + 1)
+        if step.phase is not before.phase:
+            before.phase.end()
+        self.iteration = step.last_iteration
+        self.integrator.sh_degree = self.sh_degree_at(step.iterations[0])
+        return step
+
+    def _begin_effects(self, step: Step) -> None:
+        """Bring effects, and the sensors of views of other ranks, to where they are now."""
+        fit = self.fit_state(step, step.iterations[0])
+        for effect in self.effects:
+            effect.begin(fit)
+
+        def move_sensor(view: StepView) -> None:
+            for effect in self.effects:
+                if effect.moves_sensors:
+                    effect.before_render(fit, view.view)
+
+        self.gradients.begin(step.views, move_sensor)
+
+    def _begin_view(self, step: Step, view: StepView) -> None:
+        """Let effects prepare a view's sensor and background, and a thread read the next ones."""
         self.read_ahead(self._coming_views(step, view.iteration))
         fit = self.fit_state(step, view.iteration)
         for effect in self.effects:
             effect.before_render(fit, view.view)
         self.gradients.begin_view(view)
-        rendered = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
-        image, loss, error = self.compare(cast(TensorXf, rendered), view.view)
-        dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
-        image, photograph = dr.detach(image), view.view.target.image
-        weights = self._pixel_weights(view.iteration)
+
+    def _end_view(self, view: StepView, image: TensorXf) -> None:
+        """Compute what the strategy sums over the pixels of each Gaussian."""
+        photograph, weights = view.view.target.image, self._pixel_weights(view.iteration)
         planes = {name: weigh(image, photograph) for name, weigh in weights.items()}
         self.gradients.end_view(view, planes)
-        return ViewLoss(dr.detach(loss), error, view.view.counted_share)
 
     def _coming_views(self, step: Step, iteration: int) -> Iterator[TrainingView]:
         """Yield the views of the fit from an iteration of ``step`` on."""
@@ -191,26 +218,6 @@ class Trainer:
             if step.last_iteration >= self.config.last_iteration:
                 break
             step = self.plan(step.last_iteration + 1)
-
-    def _begin_step(self) -> Step:
-        """Plan the next step, and bring the scene to where the optimizer is."""
-        before, step = self.last_step, self.plan(self.iteration + 1)
-        if step.stage is not before.stage:
-            before.stage.end()
-        self.iteration = step.last_iteration
-        self.integrator.sh_degree = self.sh_degree_at(step.iterations[0])
-        self.params.update(self.optimizer)
-        fit = self.fit_state(step, step.iterations[0])
-        for effect in self.effects:
-            effect.begin(fit)
-
-        def place(view: StepView) -> None:
-            for effect in self.effects:
-                if effect.moves_sensors:
-                    effect.before_render(fit, view.view)
-
-        self.gradients.begin(step.views, place)
-        return step
 
     def _differentiate_penalties(self, step: Step) -> Sequence[Float | np.ndarray]:
         """Add the derivatives of the strategy's terms of the loss; return the terms."""
@@ -319,7 +326,7 @@ class Trainer:
 
     def plan(self, iteration: int) -> Step:
         """Return the step that an iteration is part of."""
-        return plan_step(iteration, self.config, self.rates, self.stages)
+        return plan_step(iteration, self.config, self.rates, self.phases)
 
     def fit_state(self, step: Step | None = None, iteration: int | None = None) -> FitState:
         """Return the state for effects, by default after the last step."""
@@ -328,11 +335,11 @@ class Trainer:
         return FitState(
             iteration=iteration,
             iterations_of_step=step.iterations,
-            begins_stage=step.begins_stage,
+            begins_phase=step.begins_phase,
             rate_decay=self.rates.means(iteration) / self.rates.means.initial,
             integrator=self.integrator,
             means=cast(TensorXf, self.optimizer["means"]),
-            views=step.stage.views,
+            views=step.phase.views,
             effects=self.effects,
         )
 

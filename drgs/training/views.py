@@ -25,7 +25,7 @@ class TrainingView:
     """A photograph of the training split, at the size of one stage; in display space.
 
     Targets and uploads are computed from the dataset when an iteration needs them, and stay on the
-    device while there is room: see :class:`drgs.training.steps.Stage`.
+    device while there is room: see :class:`drgs.training.steps.ResolutionPhase`.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class FitState:
 
     iteration: int  # from 1
     iterations_of_step: range
-    begins_stage: bool  # whether the images have other sizes than in the step before
+    begins_phase: bool  # whether the images have other sizes than in the step before
     rate_decay: float  # the means' learning rate, relative to the initial one
     integrator: SplatsPlugin  # renders the fit
     means: TensorXf  # (N, 3), world

@@ -38,7 +38,7 @@ class Halves(DensityStrategy):
 
     def refine(self, population, iteration):
         kept = np.arange(population.num_rows // 2)
-        population.edit(population.rows(kept))
+        population.edit(population.to_device_indices(kept))
         return DensityReport(num_gaussians=len(kept))
 
 

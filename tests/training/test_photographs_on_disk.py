@@ -23,8 +23,7 @@ from drgs.core.errors import UserError
 from drgs.datasets import images, reader, storage
 from drgs.datasets.storage import DiskStore, is_on_disk, scratch_folder
 from drgs.fit import memory
-from drgs.training.read_ahead import NUM_AHEAD
-from drgs.training.steps import view_of
+from drgs.training.steps import NUM_AHEAD, view_of
 from drgs.training.trainer import Trainer
 
 PLANES = ("image", "alpha", "mask", "depth")

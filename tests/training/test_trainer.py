@@ -73,16 +73,15 @@ def test_population_may_change_without_higher_degrees():
 
 
 def indices_on_device(trainer):
-    """Indices of the views whose targets are on the device, by stage."""
+    """Indices of the views whose targets are on the device, by phase."""
     return [
-        {view.index for view in stage.views if "photograph" in vars(view)}
-        for stage in trainer.stages
+        {view.index for view in phase.views if "photograph" in vars(view)}
+        for phase in trainer.phases
     ]
 
 
-def test_targets_are_cached_within_the_memory_limit(monkeypatch):
-    monkeypatch.setattr(steps_module, "MAX_TARGET_BYTES", 2 * 20 * 16 * TARGET_BYTES + 7)
-    trainer, seen = make_trainer(), []
+def test_targets_are_cached_within_the_memory_limit():
+    trainer, seen = make_trainer(room=2 * 20 * 16 * TARGET_BYTES + 7), []
     assert indices_on_device(trainer) == [set()]
     for _ in range(8):  # two rounds of four views
         trainer.step()

@@ -185,7 +185,7 @@ class AdaptiveDensityControl(DensityStrategy):
             )
         if num_added > 0 or len(chosen.keep) < num_before:
             append = self._new_rows(population, chosen, iteration) if num_added > 0 else None
-            population.edit(population.rows(chosen.keep), append)
+            population.edit(population.to_device_indices(chosen.keep), append)
         return DensityReport(
             num_added=num_added - len(chosen.split),
             cloned=len(chosen.clone),
@@ -280,7 +280,7 @@ class AdaptiveDensityControl(DensityStrategy):
         log_shrink[num_clones:] = math.log(self.settings.split_shrink)
 
         t = types_of(type(population.value("means").array))
-        rows = population.take(population.rows(np.append(chosen.clone, samples_of)))
+        rows = population.take(population.to_device_indices(np.append(chosen.clone, samples_of)))
         rows["means"] = displace_means(rows, normals)
         shrink = t.TensorXf(from_host(t.Float, log_shrink), normals.shape)
         rows["log_scales"] = rows["log_scales"] - shrink

@@ -143,7 +143,7 @@ class GrowthToNumber(DensityStrategy):
         split = np.sort(candidates[:room])
         if len(split) > 0 or kept < before:
             keep[split] = False
-            rows = population.rows(np.flatnonzero(keep))
+            rows = population.to_device_indices(np.flatnonzero(keep))
             population.edit(rows, halves(population, split) if len(split) > 0 else None)
         self.begin(population)
         return DensityReport(
@@ -193,7 +193,7 @@ def halves(population: Population, rows: np.ndarray) -> dict[str, dr.ArrayBase]:
     The halves' means lie on both sides of the Gaussian's, on its longest axis.
     """
     twice = np.tile(rows, 2)
-    new = population.take(population.rows(twice))
+    new = population.take(population.to_device_indices(twice))
     longest = population.host("log_scales")[twice].argmax(axis=1)
     offsets = np.zeros((len(twice), 3))
     offsets[np.arange(len(twice)), longest] = np.repeat([HALF_OFFSET, -HALF_OFFSET], len(rows))

@@ -79,7 +79,7 @@ class Floaters(DensityStrategy):
         if not floats.any() or floats.all():
             return None
         kept = np.flatnonzero(~floats)
-        population.edit(population.rows(kept))
+        population.edit(population.to_device_indices(kept))
         return DensityReport(num_gaussians=len(kept), pruned=len(floats) - len(kept))
 
     def find(self, gaussians: Gaussians[TensorXf]) -> np.ndarray:

@@ -185,9 +185,9 @@ class MarkovChain(DensityStrategy):
             offsets[: len(drawn)] = 0
             rows["means"] = displace_means(rows, config.spread * offsets)
             alive[drawn] = False
-            population.edit(population.rows(np.flatnonzero(alive)), rows)
+            population.edit(population.to_device_indices(np.flatnonzero(alive)), rows)
         elif num_alive < before:
-            population.edit(population.rows(np.flatnonzero(alive)))
+            population.edit(population.to_device_indices(np.flatnonzero(alive)))
         relocated = min(before - num_alive, len(copied))
         return DensityReport(
             num_gaussians=aim,
@@ -231,7 +231,7 @@ def _copies(
     drawn, counts = np.unique(copied, return_counts=True)
     shared, factors = correct_copies(opacities[drawn], counts + 1)
     shared = np.clip(shared, min_opacity, MAX_OPACITY)
-    rows = population.take(population.rows(np.append(drawn, copied)))
+    rows = population.take(population.to_device_indices(np.append(drawn, copied)))
     # Of each new row, the place of its source among those that were drawn.
     source = np.append(np.arange(len(drawn)), np.searchsorted(drawn, copied))
     t = types_of(type(rows["logit_opacities"]))

@@ -183,7 +183,7 @@ def best_rows(scores: np.ndarray, count: int) -> np.ndarray:
 
 def keep_best(population: Population, scores: np.ndarray, count: int) -> DensityReport:
     """Remove all but the ``count`` rows of the highest scores (N,), which keep their moments."""
-    population.edit(population.rows(best_rows(scores, count)))
+    population.edit(population.to_device_indices(best_rows(scores, count)))
     return DensityReport(num_gaussians=count, pruned=len(scores) - count)
 
 

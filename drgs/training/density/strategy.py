@@ -191,10 +191,10 @@ def density_strategy(
         from drgs.training.density.pruning import METHODS
 
         phases.append(METHODS[densify.prune.method].from_config(config, dataset, None))
-    return growth if len(phases) == 1 else Phases(phases)
+    return growth if len(phases) == 1 else PhasedStrategy(phases)
 
 
-class Phases(DensityStrategy):
+class PhasedStrategy(DensityStrategy):
     """A sequence of strategies; if one changes rows, the others are reset."""
 
     def __init__(self, phases: Sequence[DensityStrategy]) -> None:

@@ -138,7 +138,7 @@ class ShardedPopulation(Population):
         wanted = np.array(rows)
         owners = self.shard.owners(wanted)
         place = np.argsort(owners, kind="stable")
-        local = self.rows(wanted[owners == self.shard.rank] - self.first_row)
+        local = self.to_device_indices(wanted[owners == self.shard.rank] - self.first_row)
         taken = {}
         for name, values in super().take(local).items():
             gathered = self.comm.all_gather_rows(np.array(values).reshape(values.shape))

@@ -18,7 +18,12 @@ from drgs.config import extensions
 from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import Gaussians
 from drgs.training import trainer as trainer_module
-from drgs.training.density.strategy import DensityReport, DensityStrategy, Phases, density_strategy
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    PhasedStrategy,
+    density_strategy,
+)
 
 
 def trainer_with(monkeypatch, strategy, **changes):
@@ -155,7 +160,7 @@ class Phase(DensityStrategy):
 
 def test_phases_act_as_one_strategy_and_restart_after_row_changes():
     first, last = Phase("first", {2, 4}), Phase("last", {4, 6}, num=7)
-    phases = Phases((first, last))
+    phases = PhasedStrategy((first, last))
     assert [i for i in range(1, 9) if phases.is_due(i)] == [2, 4, 6]
     assert [i for i in range(1, 9) if phases.needs_statistics(i)] == [1, 2, 3, 4, 5, 6]
     assert phases.rate_factors(1) == {"means": 4.0, "first": 3.0, "last": 3.0}
