@@ -361,7 +361,7 @@ class Trainer:
     @property
     def views(self) -> list[TrainingView]:
         """The training views, at the image size that is in use."""
-        return self.last_step.stage.views
+        return self.last_step.phase.views
 
     @property
     def sh_degree(self) -> int:
@@ -447,7 +447,7 @@ class Trainer:
 
     def release(self) -> None:
         """Free memory that only iterations need; the scene still renders the fit's Gaussians."""
-        self.last_step.stage.end()
+        self.last_step.phase.end()
         self.optimizer.state.clear()
         release_unused_memory()
 
