@@ -185,7 +185,7 @@ def add_observers(
         from drgs.live_page.server import url
 
         trainer = session.trainer
-        viewer, session.criterion = watch(server, trainer, trainer.dataset, session.criterion)
+        viewer, session.continues = watch(server, trainer, trainer.dataset, session.continues)
         session.observers.append(viewer)
         print(f"look on at {url(server)}", flush=True)
 

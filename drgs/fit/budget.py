@@ -4,7 +4,7 @@
 :class:`Strategy`, in the time of an iteration at the start of a fit, with full images and the first
 Gaussians. A rehearsal of the planned fit converts it to seconds, and the strategy whose curve is
 highest at the deadline is chosen. Curves of another scene predict a time to some ten or twenty per
-cent, so the clock ends the fit (:class:`Deadline`): it cuts the last phase, when rates are small,
+cent, so the clock ends the fit (:func:`until`): it cuts the last phase, when rates are small,
 or appends iterations at the final rates. The resulting configuration gives the same bytes without a
 clock.
 """
@@ -25,7 +25,6 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
-from typing_extensions import override
 
 from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
@@ -33,9 +32,9 @@ from drgs.core.errors import UserError, UserNote
 from drgs.datasets.types import Dataset
 from drgs.effects.base import TrainingEffect
 from drgs.fit.inputs import share_inputs
-from drgs.fit.loop import StopCriterion
+from drgs.fit.loop import Continues
 from drgs.fit.memory import room_for_targets
-from drgs.fit.report import seconds_of_curves, seconds_of_results
+from drgs.fit.report import seconds_of_results
 from drgs.gaussians.parameters import Gaussians
 from drgs.training.density.strategy import DensityStrategy
 from drgs.training.losses import Loss
@@ -157,7 +156,6 @@ class Candidate:
     """A strategy, and the iterations and the PSNR that a given time allows."""
 
     strategy: Strategy
-    curve: Curve
     iterations: int
     psnr: float  # dB, on the shipped scene
 
@@ -196,7 +194,7 @@ def make_plan(
             iterations = curve.iterations_in(seconds / start_s) if seconds > 0 else 0
             if iterations >= MIN_ITERATIONS:
                 psnr = curve.psnr_at(iterations)
-                candidates.append(Candidate(strategy, curve, iterations, psnr))
+                candidates.append(Candidate(strategy, iterations, psnr))
     if not candidates:
         raise UserError(
             f"--budget: must leave time for {MIN_ITERATIONS} iterations, got "
@@ -284,7 +282,7 @@ def plan_fit(
     num_points, most = gaussians.num_gaussians, target_of(config) or 0
     results = seconds_of_results(scene, dataset, max(num_points, most), config.model.sh_degree)
     images = results.renders if config.output.save_renders else 0.0
-    images += results.report + seconds_of_curves() if config.output.report else 0.0
+    images += results.report if config.output.report else 0.0
     if images > MAX_IMAGES_SHARE * (end - time.perf_counter()):
         note = (
             "--budget: the time is needed for iterations: no report, orbit and images are "
@@ -307,17 +305,13 @@ def plan_fit(
     return replace(plan, end=end)
 
 
-class Deadline(StopCriterion):
-    """Ends a fit when its time is up, by the clock of rank 0."""
+def until(end: float, comm: Communicator) -> Continues:
+    """Let a fit run until ``end``, by ``time.perf_counter`` of rank 0."""
 
-    def __init__(self, end: float, comm: Communicator) -> None:
-        """end: when the last iteration is to end, by ``time.perf_counter``."""
-        self._end, self._comm = end, comm
+    def is_time_left(trainer: Trainer) -> bool:
+        return bool(comm.broadcast_numbers(time.perf_counter() < end or trainer.iteration == 0))
 
-    @override
-    def should_continue(self, trainer: Trainer) -> bool:
-        is_time_left = time.perf_counter() < self._end or trainer.iteration == 0
-        return bool(self._comm.broadcast_numbers(is_time_left))
+    return is_time_left
 
 
 _NUMBER = r"(\d+(?:\.\d+)?)"

@@ -14,7 +14,7 @@ import numpy as np
 from typing_extensions import override
 
 from drgs.datasets.types import Dataset
-from drgs.fit.loop import History, Iteration, Observer, StopCriterion, exponential_mean
+from drgs.fit.loop import Continues, History, Iteration, Observer, exponential_mean
 from drgs.live_page.frames import LiveScene
 from drgs.live_page.page import Page, StartView, event_handler
 from drgs.live_page.scheduler import RenderRequests, RenderScheduler
@@ -43,16 +43,9 @@ CURVES: dict[str, uplot.Series] = {
 }  # by title
 
 
-class EarlyStop(StopCriterion):
-    """The stop criterion ``criterion``, or a viewer client's request to end."""
-
-    def __init__(self, criterion: StopCriterion, requests: RenderRequests) -> None:
-        self._criterion, self._requests = criterion, requests
-
-    @override
-    def should_continue(self, trainer: Trainer) -> bool:
-        is_ended = self._requests.ended and trainer.iteration > 0
-        return not is_ended and self._criterion.should_continue(trainer)
+def unless_ended(continues: Continues, requests: RenderRequests) -> Continues:
+    """Also end a fit where a viewer client has asked for it."""
+    return lambda trainer: not (requests.ended and trainer.iteration > 0) and continues(trainer)
 
 
 class TrainingViewer(Observer):
@@ -193,17 +186,14 @@ class TrainingPage(Page):
 
 
 def watch(
-    server: viser.ViserServer, trainer: Trainer, dataset: Dataset, criterion: StopCriterion
-) -> tuple[TrainingViewer, StopCriterion]:
-    """Show a fit on the server's page; return the observer that serves it, and its criterion."""
-    requests, start = (
-        RenderRequests(),
-        StartView.from_views(dataset.train).move_back(START_DISTANCE_FACTOR),
-    )
-    criterion = EarlyStop(criterion, requests)
+    server: viser.ViserServer, trainer: Trainer, dataset: Dataset, continues: Continues
+) -> tuple[TrainingViewer, Continues]:
+    """Show a fit on the server's page; return the observer that serves it, and its end."""
+    requests = RenderRequests()
+    start = StartView.from_views(dataset.train).move_back(START_DISTANCE_FACTOR)
     page = TrainingPage(server, requests, start, trainer.config.model.approximations)
     page.add_cameras(dataset.train, visible=True)
-    return TrainingViewer(requests, page, dataset), criterion
+    return TrainingViewer(requests, page, dataset), unless_ended(continues, requests)
 
 
 def psnr_curves(rows: Sequence[HistoryRow]) -> list[Curve]:

@@ -94,12 +94,13 @@ def exponential_mean(values: Iterable[float]) -> np.ndarray:
     return np.fromiter(accumulate(values, smoother), np.float64)
 
 
-class StopCriterion:
-    """Ends a fit after the iterations of its configuration; subclasses decide otherwise."""
+Continues = Callable[[Trainer], bool]
+"""Returns whether a fit runs another step; all ranks call it."""
 
-    def should_continue(self, trainer: Trainer) -> bool:
-        """Return whether to run another iteration; all ranks of a fit call it."""
-        return trainer.iteration < trainer.config.last_iteration
+
+def until_planned_end(trainer: Trainer) -> bool:
+    """Return whether the iterations of the configuration are not done yet."""
+    return trainer.iteration < trainer.config.last_iteration
 
 
 @dataclass(frozen=True)
@@ -123,31 +124,33 @@ class Observer(Protocol):
         """
 
 
-def iterations(trainer: Trainer, history: History, criterion: StopCriterion) -> Iterator[Iteration]:
+def iterations(
+    trainer: Trainer, history: History, continues: Continues = until_planned_end
+) -> Iterator[Iteration]:
     """Run the remaining iterations: a generator, one step an item.
 
     Rows are added to ``history`` every ``output.history_every`` iterations, and for the last one.
     There, and at changes of the population, ``NonFiniteError`` is raised if a loss, a gradient or a
     value is not finite.
     """
-    continues = _continues(trainer, criterion)
-    while continues:
+    is_last = _is_last(trainer, continues)
+    while not is_last:
         report, row = trainer.step(), None
         if report.density is not None:
             history.add_density(report.iteration, report.density)
-        continues = _continues(trainer, criterion)
-        if not continues or report.passes(trainer.config.output.history_every):
+        is_last = _is_last(trainer, continues)
+        if is_last or report.passes(trainer.config.output.history_every):
             row = history.add(report)
             trainer.check_iterations()  # reading the row has waited for the device
-        yield Iteration(report, row, is_last=not continues)
+        yield Iteration(report, row, is_last)
 
 
-def _continues(trainer: Trainer, criterion: StopCriterion) -> bool:
-    """Ask the criterion; a fit that it ends otherwise than planned records where."""
-    continues, config = criterion.should_continue(trainer), trainer.config
-    if not continues and trainer.iteration != config.last_iteration:
+def _is_last(trainer: Trainer, continues: Continues) -> bool:
+    """Return whether a fit ends; one that ends otherwise than planned records where."""
+    is_last, config = not continues(trainer), trainer.config
+    if is_last and trainer.iteration != config.last_iteration:
         trainer.config = with_changes(config, {"stop_after": trainer.iteration})
-    return continues
+    return is_last
 
 
 class HeldOutQuality(Observer):

@@ -31,19 +31,20 @@ from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.folders import config_for
 from drgs.effects.base import Examination, Examiner, TrainingEffect
-from drgs.fit.budget import REHEARSAL_SHARE, Budget, Deadline, Plan, plan_fit, rehearse
+from drgs.fit.budget import REHEARSAL_SHARE, Budget, Plan, plan_fit, rehearse, until
 from drgs.fit.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.fit.fingerprint import Fingerprint, fingerprint_of
 from drgs.fit.fit_folder import FitFolder, saved_gaussians
 from drgs.fit.inputs import share_gaussians, share_inputs
 from drgs.fit.loop import (
+    Continues,
     HeldOutQuality,
     History,
     Iteration,
     Observer,
-    StopCriterion,
     iterations,
     smoother,
+    until_planned_end,
 )
 from drgs.fit.memory import room_for_targets
 from drgs.fit.summary import summary_of_fit
@@ -105,7 +106,7 @@ class FitSession:
     examination: Examination | None = field(init=False, default=None)
     trainer: Trainer = field(init=False)
     history: History = field(init=False)
-    criterion: StopCriterion = field(init=False, default_factory=StopCriterion)
+    continues: Continues = field(init=False, default_factory=lambda: until_planned_end)
     observers: list[Observer] = field(init=False, default_factory=list)
     _fingerprint: Fingerprint | None = field(init=False, default=None)
 
@@ -134,7 +135,7 @@ class FitSession:
                 if self.examination is not None:
                     folder.write_examination(self.examination)
             if plan is not None:
-                self.criterion = Deadline(plan.end, self.comm)
+                self.continues = until(plan.end, self.comm)
                 if folder is not None and self.budget is not None:
                     folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
             self.on_start(self)
@@ -275,7 +276,7 @@ class FitSession:
                 progress = RunProgress("iteration", total, trainer.iteration)
                 observers.insert(0, ProgressLine(blocks.enter_context(progress)))
                 blocks.enter_context(stop)
-            for done in iterations(trainer, self.history, self.criterion):
+            for done in iterations(trainer, self.history, self.continues):
                 self.check_ranges()
                 for observer in observers:
                     observer.after_iteration(trainer, self.history, done, lambda: stop.requested)
@@ -374,7 +375,7 @@ def train(
     with reporting_extensions():
         session.prepare()
         trainer, history = session.trainer, session.history
-        for done in iterations(trainer, history, session.criterion):
+        for done in iterations(trainer, history, session.continues):
             if callback is not None and callback(done.report):
                 break
     gaussians = saved_gaussians(trainer.gaussians(), trainer.config)

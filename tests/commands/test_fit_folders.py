@@ -28,7 +28,6 @@ from support.small_capture import blobs
 from drgs.config.load import load_config
 from drgs.core.folders import sole_writer
 from drgs.fit import session
-from drgs.fit.loop import StopCriterion
 from drgs.render import __main__ as render
 from drgs.results.folder import continue_run
 
@@ -47,16 +46,6 @@ BUDGET = ("--budget", "60s")
 
 class Killed(BaseException):
     """An exception that no code handles."""
-
-
-class Clock(StopCriterion):
-    """The end of a fit whose time is up."""
-
-    def __init__(self, *_):
-        pass
-
-    def should_continue(self, trainer):
-        return trainer.iteration < LAST
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +90,7 @@ def quick(monkeypatch):
     plan = partial(SimpleNamespace, reasons="planned", chosen=Mock(), end=0.0)
     monkeypatch.setattr(session, "plan_fit", lambda config, *_: plan(config=config))
     monkeypatch.setattr(session, "rehearse", lambda *_, **__: (Mock(), 1.0))
-    monkeypatch.setattr(session, "Deadline", Clock)
+    monkeypatch.setattr(session, "until", lambda *_: lambda trainer: trainer.iteration < LAST)
 
 
 def assert_as_uninterrupted(folder, projects):

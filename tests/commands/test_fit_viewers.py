@@ -31,7 +31,7 @@ from drgs.datasets import load_dataset
 from drgs.fit import __main__ as fit
 from drgs.fit import fit_folder
 from drgs.fit import live_view as training_viewer
-from drgs.fit.live_view import EarlyStop, TrainingViewer
+from drgs.fit.live_view import TrainingViewer, unless_ended
 from drgs.gaussians.parameters import Gaussians
 from drgs.live_page.frames import FrameRequest, ViewerCamera
 from drgs.live_page.scheduler import RenderRequests
@@ -65,7 +65,7 @@ def viewer_page(monkeypatch):
         screen.show.side_effect = ask
         screen.show_progress.side_effect = lambda t, *_: t.iteration == 4 and queue.end()
         ask()
-        length = EarlyStop(length, queue)
+        length = unless_ended(length, queue)
         return TrainingViewer(queue, screen, dataset), length
 
     monkeypatch.setattr(training_viewer, "watch", watch)

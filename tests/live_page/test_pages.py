@@ -26,7 +26,7 @@ from websockets.sync.client import connect
 
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.fit.live_view import TrainingPage, watch
-from drgs.fit.loop import History, HistoryRow, StopCriterion, iterations
+from drgs.fit.loop import History, HistoryRow, iterations, until_planned_end
 from drgs.live_page.frames import FRAME_CONTENTS, VIEWER_LENSES
 from drgs.live_page.page import ADJUSTABLE_APPROXIMATIONS, Page, StartView
 from drgs.live_page.scheduler import RenderRequests
@@ -436,11 +436,11 @@ def test_fit_with_hostile_clients_has_the_same_bytes(server, capfd, monkeypatch)
     settings = {"iterations": 40, "densify__start": 2, "densify__stop": 30, "densify__every": 5}
     dataset = true_dataset()
     alone, watched = (make_trainer(dataset, **settings) for _ in range(2))
-    for _ in iterations(alone, History(), StopCriterion()):
+    for _ in iterations(alone, History()):
         pass
     history, served = History(), Mock(wraps=TrainingPage.show)
     monkeypatch.setattr(TrainingPage, "show", lambda *arguments: served(*arguments))
-    watching, length = watch(server, watched, dataset, StopCriterion())
+    watching, length = watch(server, watched, dataset, until_planned_end)
     controls = server.gui._gui_input_handle_from_uuid  # viser has no public list
     harmless = [u for u, c in controls.items() if getattr(c, "label", "") not in STOPPING]
     is_over = threading.Event()
