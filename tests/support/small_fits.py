@@ -171,10 +171,12 @@ def config_of(**changes) -> FitConfig:
     return with_changes(config, changes)
 
 
-def make_trainer(dataset: Dataset, gaussians: Gaussians | None = None, **changes) -> Trainer:
+def make_trainer(
+    dataset: Dataset, gaussians: Gaussians | None = None, room: int = 2 << 30, **changes
+) -> Trainer:
     """See :func:`config_of`; ``__`` is written for the dot."""
     values = {key.replace("__", "."): value for key, value in changes.items()}
-    return Trainer(config_of(**values), dataset, gaussians or disturbed_blobs())
+    return Trainer(config_of(**values), dataset, gaussians or disturbed_blobs(), room=room)
 
 
 def with_numbers(trainer: Trainer, **values) -> Trainer:
