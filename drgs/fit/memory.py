@@ -19,7 +19,6 @@ from drgs.datasets.types import Dataset, View
 from drgs.splatting.reduction import BAND_SLOTS
 from drgs.training.density.strategy import density_strategy
 from drgs.training.parallel.communicator import Communicator
-from drgs.training.steps import MAX_TARGET_BYTES
 
 PROCESS_BYTES = 290_000_000  # memory of interpreter, libraries, compiled kernels, and results
 

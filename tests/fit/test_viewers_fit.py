@@ -9,8 +9,8 @@ from support.viewer_rendering import VIEWER_RENDERING
 from drgs.config.changes import with_changes
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserNote
-from drgs.fit import for_viewers as viewers
-from drgs.fit.for_viewers import for_viewers, num_iterations, tuning
+from drgs.fit import viewers_fit as viewers
+from drgs.fit.viewers_fit import for_viewers, num_iterations, tuning
 from drgs.integrator.scene import make_scene, render_views
 from drgs.training.trainer import Trainer
 
