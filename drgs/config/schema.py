@@ -421,8 +421,8 @@ def _read_revised_plan(values: Mapping[Any, object]) -> Mapping[Any, object]:
             aims.append(section[key])
     try:
         if aims and aims[0]:
-            ends = aims[0][-1].get("end", 0), values["iterations"]
-            values |= {"iterations": max(ends), "stop_after": values["iterations"]}
+            last: Any = values["iterations"]
+            values |= {"iterations": max(last, aims[0][-1].get("end", 0)), "stop_after": last}
     except (AttributeError, KeyError, TypeError):
         got = f"means_lr_aims must be a list of after and end, got {aims[0]}"
         raise ValueError(f"optimizer.{got}; remove it") from None

@@ -121,7 +121,7 @@ def room_for_targets(config: FitConfig, dataset: Dataset, start: int, comm: Comm
 
     comm.collective(check)
     left = usable - round(1.15 * memory.required_bytes)  # an estimate may be wrong
-    return max(0, min(MAX_TARGET_BYTES, left))
+    return max(0, left)
 
 
 def _refusal(

@@ -403,9 +403,10 @@ class SensorRender:
             surfaces = repeat(None) if traced is None else traced.value
             projected = self.splats.projected
             splats = repeat(None) if projected is None else projected.splats
+            by_time = zip(self._cameras(state), surfaces, splats, strict=False)
             return [
-                self._render_time(gaussians, camera, pipeline, *of_time)
-                for camera, *of_time in zip(self._cameras(state), surfaces, splats, strict=False)
+                self._render_time(gaussians, camera, pipeline, in_passes, of_time)
+                for camera, in_passes, of_time in by_time
             ]
 
         return self.splats.cache.find(f"frames {self.index}", *key, render_all).value

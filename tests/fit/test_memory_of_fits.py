@@ -120,7 +120,7 @@ def room(config, dataset):
 def test_targets_get_what_is_left(available):
     config, dataset = config_of(1000, 1000), dataset_of(100, 100, 20)
     peak = estimated(config, dataset)
-    for left, expected in ((0, 0), (10**6, 10**6), (9 * GB, memory.MAX_TARGET_BYTES)):
+    for left, expected in ((0, 0), (10**6, 10**6), (9 * GB, 9 * GB)):
         available(1.15 * peak.required_bytes + left)
         assert room(config, dataset) == pytest.approx(expected, abs=10)
 

@@ -43,7 +43,7 @@ from drgs.splatting.rendering import (
 from drgs.splatting.tiles import Footprints
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.exchange import SharedView, SplatExchange
-from drgs.training.parallel.local_splats import LocalSplats
+from drgs.training.parallel.local_splats import Blocks, LocalSplats
 from drgs.training.parallel.population import renderer_of
 from drgs.training.steps import StepView, ViewGradients, ViewLoss
 
@@ -93,7 +93,9 @@ class SeveralViews:
         for each in sent:
             move_sensor(each.view)
         num_times = [len(self._cameras(each.view)) for each in self._views]
-        packed = {each: self._exchange.pack(each, self._project(each)) for each in sent}
+        packed: dict[SharedView, list[Blocks]] = {}
+        for each in sent:
+            packed[each] = self._exchange.pack(each, self._project(each))
         self._exchange.send_splats(self._views, num_times, packed)
 
     def own_views(self) -> list[StepView]:
