@@ -86,6 +86,6 @@ def test_a_package_that_is_not_installed_is_refused(no_checkout):
 
     with (
         mock.patch.object(registry, "distribution", find_none),
-        pytest.raises(UserError, match='^drgs is not installed: .* run "pip install"'),
+        pytest.raises(UserError, match=r'^drgs is not installed: .* run "pip install"'),
     ):
         _ = STRATEGIES.shipped_names
