@@ -10,8 +10,11 @@
 :func:`examine` tells which effects they call for, :func:`train` fits Gaussians to them, and
 :func:`rasterization` renders differentiably. :data:`EXAMPLE` is the file of a fitted crane truck.
 
-Importing ``drgs`` registers Mitsuba's plugins ``splats`` and ``calibrated`` for the active variant
-and for every later one. Public names are imported when they are first used.
+Importing ``drgs`` selects the LLVM that Dr.Jit will load, registers the plugins ``splats``,
+``splatpath``, ``calibrated`` and ``splats_minimal`` with each Mitsuba variant that is active or
+set later, and changes nothing else. To do so it puts at most two finders first on
+``sys.meta_path``: one finds no module, and notices when a variant of Mitsuba is imported; in a
+checkout, the other finds ``drgs.plugins``. Public names are imported when they are first used.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drgs import _registration
-from drgs.core import errors, llvm
+from drgs.core import llvm
 
 if TYPE_CHECKING:
     from drgs.datasets import load_dataset
@@ -42,7 +45,6 @@ llvm.select_newest_llvm()
 llvm.check_llvm_variants()
 _registration.map_sibling_plugins()
 _registration.register_plugins()
-errors.show_causes_last()
 
 _MODULES = {
     "Gaussians": "drgs.gaussians.parameters",

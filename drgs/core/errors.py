@@ -7,13 +7,9 @@ from __future__ import annotations
 
 import difflib
 import re
-import sys
-import traceback
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from typing_extensions import override
 
@@ -89,44 +85,3 @@ def did_you_mean(name: str, candidates: Iterable[str], cutoff: float = 0.7) -> s
         leaf = difflib.get_close_matches(name.rpartition(".")[2], by_leaf, n=1, cutoff=cutoff)
         nearest = [by_leaf[leaf[0]]] if leaf else []
     return f"; did you mean {nearest[0]}?" if nearest else ""
-
-
-def show_causes_last() -> None:
-    """Print a user's error again after the traceback of the RuntimeError that Dr.Jit made of it.
-
-    Its text "see above" may be pages away. Works in scripts and, if called there, in notebooks.
-    """
-    if getattr(sys.excepthook, "func", None) is _show_with_cause:
-        return
-    sys.excepthook = partial(_show_with_cause, sys.excepthook)
-    if "IPython" in sys.modules and (shell := sys.modules["IPython"].get_ipython()) is not None:
-        shell.set_custom_exc((RuntimeError,), _show_in_notebook)
-
-
-def _show_with_cause(
-    show: Callable[[type[BaseException], BaseException, TracebackType | None], object],
-    kind: type[BaseException],
-    error: BaseException,
-    tb: TracebackType | None,
-) -> None:
-    show(kind, error, tb)
-    _show_cause(error)
-
-
-def _show_in_notebook(
-    shell: Any,  # IPython's InteractiveShell
-    kind: type[BaseException],
-    error: BaseException,
-    tb: TracebackType | None,
-    tb_offset: int | None = None,
-) -> None:
-    shell.showtraceback((kind, error, tb), tb_offset=tb_offset)
-    _show_cause(error)
-
-
-def _show_cause(error: BaseException) -> None:
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, UserError):
-        cause = cause.__cause__ or cause.__context__
-    if cause is not None and cause is not error:
-        print(*traceback.format_exception_only(cause), sep="", end="", file=sys.stderr)

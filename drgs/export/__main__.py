@@ -1,6 +1,6 @@
 """``python -m drgs.export RUN_OR_FILE --format NAME``: Gaussians for other programs.
 
-Exports a file, or a fit's file for other programs (``drgs.fit.for_viewers``), in the formats of
+Exports a file, or a fit's file for other programs (``drgs.fit.viewers_fit``), in the formats of
 ``drgs.io.formats``; crops, filters, decimates and turns it upright.
 """
 
@@ -42,8 +42,8 @@ from drgs.io.formats import format_for, writable_formats
 from drgs.io.quantization import morton_order
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
 from drgs.results.folder import load_run_config
+from drgs.results.html_viewer import HONOURED, DisplaySettings, InitialView, viewer_page
 from drgs.results.refined_cameras import training_cameras
-from drgs.results.viewer_page import HONOURED, DisplaySettings, InitialView, viewer_page
 
 COMMAND = "export"
 

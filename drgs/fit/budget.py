@@ -292,7 +292,7 @@ def plan_fit(
         end -= images
     end -= results.measuring
     if not config.model.approximations.is_default:
-        from drgs.fit.for_viewers import TIME_SHARE
+        from drgs.fit.viewers_fit import TIME_SHARE
 
         end -= results.viewers
         end -= TIME_SHARE * max(0.0, end - time.perf_counter())

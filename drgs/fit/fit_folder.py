@@ -30,13 +30,13 @@ from drgs.fit.report import MAX_PICTURES, FitImages, write_images, write_results
 from drgs.gaussians.parameters import Gaussians
 from drgs.results import files, folder
 from drgs.results.history import write_density, write_history
+from drgs.results.html_viewer import DisplaySettings, shows_as_fitted
 from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
 from drgs.results.refined_cameras import write_views
-from drgs.results.viewer_page import DisplaySettings, shows_as_fitted
 from drgs.training.trainer import Trainer
 
 if TYPE_CHECKING:  # imported where it is needed
-    from drgs.fit.for_viewers import ForViewers
+    from drgs.fit.viewers_fit import ForViewers
 
 
 @dataclass(eq=False)

@@ -28,7 +28,6 @@ from drgs.splatting.grid import MICRO, TILE
 from drgs.splatting.reduction import BAND_SLOTS
 from drgs.training.density.strategy import density_strategy
 from drgs.training.parallel.communicator import Communicator
-from drgs.training.steps import MAX_TARGET_BYTES
 
 PROCESS_BYTES = 290_000_000  # memory of interpreter, libraries, compiled kernels, and results
 
@@ -185,7 +184,7 @@ def room_for_targets(
     if memory.required_bytes > usable:
         raise UserError(_refusal(config, dataset, gaussians, memory, usable, comm.size))
     left = usable - round(1.15 * memory.required_bytes)  # an estimate may be wrong
-    return max(0, min(MAX_TARGET_BYTES, memory.targets, left))
+    return max(0, min(memory.targets, left))
 
 
 def _refusal(

@@ -43,8 +43,8 @@ from drgs.results.files import (
     VIEWER,
 )
 from drgs.results.history import FitHistory, summarize_density
+from drgs.results.html_viewer import DisplaySettings, seconds_of_page, write_viewer
 from drgs.results.metrics import FitMetrics, map_ahead, psnr, ssim
-from drgs.results.viewer_page import DisplaySettings, seconds_of_page, write_viewer
 
 MAX_PICTURES = 25
 """Test views, at most, whose images are written; ``python -m drgs.render`` writes all."""

@@ -62,7 +62,7 @@ from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import StepReport, Trainer
 
 if TYPE_CHECKING:  # imported where it is needed
-    from drgs.fit.for_viewers import ForViewers
+    from drgs.fit.viewers_fit import ForViewers
 
 
 class ProgressLine(Observer):
@@ -319,7 +319,7 @@ class FitSession:
 
     def _fit_for_viewers(self, gaussians: Gaussians) -> ForViewers:
         """Return Gaussians for other viewers; the trainer is released, and renders the fit's."""
-        from drgs.fit.for_viewers import for_viewers, num_iterations
+        from drgs.fit.viewers_fit import for_viewers, num_iterations
 
         if not self.uses_terminal:
             return for_viewers(self.trainer, gaussians)

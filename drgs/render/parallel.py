@@ -11,8 +11,8 @@ import numpy as np
 
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.core.errors import UserError
-from drgs.fit.inputs import check_scene
 from drgs.integrator.scene import render_views
+from drgs.training.parallel.agreement import check_scene
 from drgs.training.parallel.communicator import Communicator, wait
 
 Render = Callable[..., Iterator[np.ndarray]]  # renders images (H, W, 3) of a scene and views

@@ -80,7 +80,7 @@ def make_stages(
     room: bytes of targets and uploads that may stay on the device. None do where photographs are
     on disk: what is read ahead costs no time.
     """
-    room = 0 if any(map(is_on_disk, views)) else room
+    room = 0 if any(map(is_on_disk, views)) else min(room, MAX_TARGET_BYTES)
     sizes = [(s.until, [smaller_view(v, s.factor) for v in views]) for s in config.coarse]
     is_refined = any(effect.moves_sensors for effect in effects)
     window = config.loss.window, config.loss.sigma

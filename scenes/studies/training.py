@@ -3,7 +3,7 @@
 ``scenes/lego_mini.yml`` is fitted with different numbers of iterations, and with one other choice
 at a time: smaller images first, fewer Gaussians, spherical harmonics of a lower degree, no SSIM.
 Each choice is a curve of the quality on the test views over the time that the fit took;
-``drgs/training/training_curves.csv`` has the curves from which ``drgs fit --budget`` plans.
+``drgs/fit/training_curves.csv`` has the curves from which ``drgs fit --budget`` plans.
 
 ``--times`` shows what plans make of these curves: a fit for each of several times, from the start
 of the command to its end. Results: ``training.md``.

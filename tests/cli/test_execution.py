@@ -17,6 +17,7 @@ from drgs.cli.execution import execution_settings
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
 from drgs.render import __main__ as render
+from drgs.render import images
 from drgs.training.trainer import Trainer
 
 DEBUG = dr.JitFlag.Debug
@@ -137,7 +138,7 @@ def test_fit_with_range_checks_gives_the_same_bytes_or_stops(tmp_path, monkeypat
 
 def test_render_fails_after_out_of_range_access(tmp_path, monkeypatch):
     blobs().save(tmp_path / "blobs.ply")
-    monkeypatch.setattr(render, "render_cameras", lambda *_: [read_beyond_the_end()])
+    monkeypatch.setattr(images, "render_cameras", lambda *_: [read_beyond_the_end()])
     words = (tmp_path / "blobs.ply", "--origin", 0, -4, 1, "--out", tmp_path / "out", "--debug")
     message = "--debug: drjit.gather(): out-of-bounds read from position 7"
     outcome = run_in_process(render.main, *words)

@@ -110,7 +110,7 @@ BREACHES = {
 @pytest.mark.parametrize("name", BREACHES)
 def test_forbidden_behaviour_is_detected(attack_folder, monkeypatch, name):
     command, message = BREACHES[name]
-    monkeypatch.setattr("drgs.render.main", lambda words: command())
+    monkeypatch.setattr("drgs.render.__main__.main", lambda words: command())
     more = {"seconds": 0.5} if name == "time" else {}
     attack = Attack("x", "render", (), encoding="ascii", named="a.yml", must_refuse=True, **more)
     wrong = trial(attack, attack_folder)
@@ -125,6 +125,6 @@ def forgetful_work(words):
 
 
 def test_work_lost_after_a_kill_is_detected(attack_folder, monkeypatch):
-    monkeypatch.setattr("drgs.render.main", forgetful_work)
+    monkeypatch.setattr("drgs.render.__main__.main", forgetful_work)
     kills = [Attack("x", "render", (), fault=Fault("kill", at), results="ab") for at in range(14)]
     assert "again: a is missing" in [line for kill in kills for line in trial(kill, attack_folder)]

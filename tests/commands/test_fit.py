@@ -30,8 +30,8 @@ from support.viewer_rendering import VIEWER_RENDERING
 from drgs.config.changes import with_changes
 from drgs.core.errors import UserNote
 from drgs.fit import budget
-from drgs.fit.for_viewers import TIME_SHARE
 from drgs.fit.report import Seconds
+from drgs.fit.viewers_fit import TIME_SHARE
 from drgs.gaussians.parameters import Gaussians
 from drgs.training.trainer import Trainer
 

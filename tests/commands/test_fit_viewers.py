@@ -177,7 +177,7 @@ def test_resumed_fit_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
     config = write_project(tmp_path, model={**VALUES["model"], **FITTED_WITH})
     without_images(monkeypatch)
     with monkeypatch.context() as broken:
-        broken.setattr("drgs.fit.for_viewers.for_viewers", lambda *_: sys.exit(7))
+        broken.setattr("drgs.fit.viewers_fit.for_viewers", lambda *_: sys.exit(7))
         with pytest.raises(SystemExit):
             fit.main([str(config), "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
@@ -190,10 +190,10 @@ def test_resumed_fit_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
 
 def test_fit_with_viewer_approximations_writes_one_file(tmp_path, monkeypatch):
     without_images(monkeypatch)
-    monkeypatch.delitem(sys.modules, "drgs.fit.for_viewers", raising=False)
+    monkeypatch.delitem(sys.modules, "drgs.fit.viewers_fit", raising=False)
     monkeypatch.delitem(sys.modules, "drgs.effects.smoothing", raising=False)
     assert_fits(write_project(tmp_path), "--out", tmp_path / "out")
     assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
     assert "viewers" not in json.loads((tmp_path / "out" / METRICS).read_text())
-    assert not {"drgs.fit.for_viewers", "drgs.effects.smoothing"} & set(sys.modules)
+    assert not {"drgs.fit.viewers_fit", "drgs.effects.smoothing"} & set(sys.modules)
     assert Gaussians.load(tmp_path / "out" / GAUSSIANS).rendered_with is None

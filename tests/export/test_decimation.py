@@ -60,7 +60,7 @@ def test_each_parameter_is_fitted(monkeypatch, degree):
 
 def test_numbers_that_become_infinite_leave_the_merged_gaussians(monkeypatch):
     monkeypatch.setattr(decimation, "ITERATIONS", 2)
-    monkeypatch.setitem(decimation.RATES, "scales_lr", np.inf)
+    monkeypatch.setitem(decimation.TOUCH_UP_RATES, "scales_lr", np.inf)
     g = blobs(12)
     with pytest.warns(UserNote, match="merged, but not fitted"):
         found = decimate(g, 6, make_dataset(3, 1).train, MODEL, GREY)

@@ -22,7 +22,6 @@ from drgs.fit import memory
 from drgs.initialization.start import initial_gaussians
 from drgs.training.losses import TARGET_BYTES
 from drgs.training.parallel.communicator import Communicator
-from drgs.training.trainer import Trainer
 
 GB = 10**9
 
@@ -126,18 +125,16 @@ def available(monkeypatch):
 
 def room(config, dataset):
     gaussians = start_of(config.init.num_points)
-    return memory.room_for_targets(config, dataset, gaussians, TARGET_BYTES, Communicator())
+    return memory.room_for_targets(config, dataset, gaussians, Communicator(), TARGET_BYTES)
 
 
-def test_targets_get_what_is_left(available, monkeypatch):
+def test_targets_get_what_is_left(available):
     config, dataset = config_of(1000, 1000), dataset_of(100, 100, 20)
     peak = estimated(config, dataset)
     assert peak.targets == 7_200_000
     for left, expected in ((0, 0), (10**6, 10**6), (GB, 7_200_000)):
         available(1.15 * peak.required_bytes + left)
         assert room(config, dataset) == pytest.approx(expected, abs=10)
-    monkeypatch.setattr(memory, "MAX_TARGET_BYTES", 3)
-    assert room(config, dataset) == 3
 
 
 def test_processes_share_gaussians_and_the_memory_of_their_machine(available):
@@ -150,10 +147,10 @@ def test_processes_share_gaussians_and_the_memory_of_their_machine(available):
     assert (shared.splats, shared.pixels) == (alone.splats, alone.pixels)
     assert shared.required_bytes < alone.required_bytes / 1.5
     available(2.1 * shared.required_bytes)
-    memory.room_for_targets(config, dataset, gaussians, TARGET_BYTES, comm)
+    memory.room_for_targets(config, dataset, gaussians, comm, TARGET_BYTES)
     available(1.9 * shared.required_bytes)
     with pytest.raises(UserError, match=r"a process of the fit needs .* for 1/4 of 1,000,000"):
-        memory.room_for_targets(config, dataset, gaussians, TARGET_BYTES, comm)
+        memory.room_for_targets(config, dataset, gaussians, comm, TARGET_BYTES)
 
 
 @pytest.mark.slow
@@ -182,17 +179,16 @@ def test_smaller_images_are_advised_where_they_help_and_else_fewer_views(availab
     available(100_000_000)
     message = r"^memory: the fit needs about .* available memory; use fewer views and Gaussians$"
     with pytest.raises(UserError, match=message):
-        Trainer(config, dataset, start_of(1000))
+        room(config, dataset)
 
 
 MEASURED = """
 import sys
 from drgs.fit import __main__ as fit
-from drgs.training import trainer
-from drgs.fit import memory
-peaks, rooms, estimate, room = [], [], memory.estimate, trainer.room_for_targets
+from drgs.fit import memory, session
+peaks, rooms, estimate, room = [], [], memory.estimate, session.room_for_targets
 memory.estimate = lambda *a, **k: peaks.append(estimate(*a, **k)) or peaks[-1]
-trainer.room_for_targets = lambda *a: rooms.append(room(*a)) or rooms[-1]
+session.room_for_targets = lambda *a: rooms.append(room(*a)) or rooms[-1]
 fit.main(sys.argv[1:])
 expected = peaks[0].required_bytes + rooms[0]
 # What getrusage says may be the peak of the process that started this one.

@@ -22,8 +22,8 @@ from drgs.config.schema import FitConfig, ModelConfig
 from drgs.fit import curves, report
 from drgs.integrator.scene import make_scene, render_views
 from drgs.results.history import DensityRow, HistoryRow
+from drgs.results.html_viewer import DisplaySettings
 from drgs.results.metrics import NUM_WAITING, ssim
-from drgs.results.viewer_page import DisplaySettings
 
 ROUNDING = 0.5 / 255 + 1e-6
 HOSTILE = "</pre><script>alert(1)</script>"

@@ -157,12 +157,12 @@ def test_the_api_lists_every_name_of_the_package():
 # ----------------------------------------------------------------------------------------------
 
 MODULES = {
-    "fit": "drgs.fit",
-    "render": "drgs.render",
+    "fit": "drgs.fit.__main__",
+    "render": "drgs.render.__main__",
     "poses": "drgs.poses.__main__",
     "examine": "drgs.examine.__main__",
-    "export": "drgs.export",
-    "view": "drgs.view",
+    "export": "drgs.export.__main__",
+    "view": "drgs.view.__main__",
     "capture": "drgs.capture.__main__",
     "bench": "drgs.bench.__main__",
 }

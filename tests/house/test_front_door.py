@@ -9,6 +9,8 @@ import drgs
 
 PUBLIC = {"Gaussians", "examine", "load_dataset", "rasterization", "train"}
 
+CALLABLE_PACKAGE = "examine"  # drgs.examine is the function, in every order of imports
+
 LAZILY = """
 import sys
 import drgs
@@ -63,7 +65,7 @@ def names_around(file):
     """Modules and packages that lie beside ``file`` or hold it, itself included."""
     parts = file.relative_to(REPOSITORY).with_suffix("").parts
     beside = {path.stem for path in file.parent.iterdir() if path.suffix == ".py" or path.is_dir()}
-    return {*parts, *beside} - {"__init__", "__main__"}
+    return {*parts, *beside} - {"__init__", "__main__", CALLABLE_PACKAGE}
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(REPOSITORY)))
@@ -75,4 +77,6 @@ def test_no_name_equals_its_module_or_package(file):
 
 
 def test_public_names_differ_from_module_names():
-    assert not PUBLIC & {path.stem for path in (REPOSITORY / "drgs").iterdir()}
+    assert PUBLIC - {CALLABLE_PACKAGE} == PUBLIC - {
+        path.stem for path in (REPOSITORY / "drgs").iterdir()
+    }

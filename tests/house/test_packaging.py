@@ -58,7 +58,7 @@ def test_every_file_is_installed_and_the_plugins_are_found(run_python, tmp_path,
 
     expected = files(REPOSITORY / "drgs")
     expected |= {f"plugins/{name}" for name in files(REPOSITORY / "plugins")}
-    assert {"results/page.html", "training/training_curves.csv", "__init__.py"} <= expected
+    assert {"results/page.html", "fit/training_curves.csv", "__init__.py"} <= expected
     assert files(installed / "drgs") == expected
     result = run_python(PRINT_PLUGINS_PATH, cwd=tmp_path, PYTHONPATH=str(installed))
     plugins = installed / "drgs" / "plugins" / "__init__.py"

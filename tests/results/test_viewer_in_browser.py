@@ -28,7 +28,7 @@ from drgs.config.approximations import Approximations
 from drgs.config.schema import ModelConfig
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.results.viewer_page import DisplaySettings, InitialView, viewer_page
+from drgs.results.html_viewer import DisplaySettings, InitialView, viewer_page
 
 fcntl = pytest.importorskip("fcntl", reason="needs POSIX")
 

@@ -9,7 +9,7 @@ from support import small_fits as fits
 from support.small_fits import kernel_hashes, steps
 from support.trainers import make_trainer
 
-from drgs.fit import memory
+from drgs.training import steps as steps_module
 from drgs.training.losses import TARGET_BYTES
 from drgs.training.steps import bytes_per_pixel
 
@@ -81,7 +81,7 @@ def indices_on_device(trainer):
 
 
 def test_targets_are_cached_within_the_memory_limit(monkeypatch):
-    monkeypatch.setattr(memory, "MAX_TARGET_BYTES", 2 * 20 * 16 * TARGET_BYTES + 7)
+    monkeypatch.setattr(steps_module, "MAX_TARGET_BYTES", 2 * 20 * 16 * TARGET_BYTES + 7)
     trainer, seen = make_trainer(), []
     assert indices_on_device(trainer) == [set()]
     for _ in range(8):  # two rounds of four views
@@ -100,7 +100,7 @@ def test_fit_does_not_depend_on_cached_targets(monkeypatch, effects):
         return trainer, fits.everything_of(steps(trainer, 8))
 
     _, kept = result()
-    monkeypatch.setattr(memory, "MAX_TARGET_BYTES", 0)
+    monkeypatch.setattr(steps_module, "MAX_TARGET_BYTES", 0)
     trainer, made_again = result()
     assert indices_on_device(trainer) == [set()]
     assert not any(view.uploads for view in trainer.views)

@@ -19,9 +19,9 @@ from drgs.cameras.viewpoints import pinhole
 from drgs.config.approximations import Approximations
 from drgs.core.errors import UserError, UserNote
 from drgs.gaussians.parameters import Gaussians
-from drgs.results import viewer_page as viewer
+from drgs.results import html_viewer as viewer
+from drgs.results.html_viewer import DisplaySettings, InitialView, viewer_page
 from drgs.results.refined_cameras import write_views
-from drgs.results.viewer_page import DisplaySettings, InitialView, viewer_page
 
 SHIPPED = resources.files("drgs.results").joinpath("supersplat_viewer")
 MANIFEST = json.loads(SHIPPED.joinpath("MANIFEST.json").read_text())

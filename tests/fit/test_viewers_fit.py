@@ -9,8 +9,8 @@ from support.viewer_rendering import VIEWER_RENDERING
 from drgs.config.changes import with_changes
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserNote
-from drgs.fit import for_viewers as viewers
-from drgs.fit.for_viewers import for_viewers, num_iterations, tuning
+from drgs.fit import viewers_fit as viewers
+from drgs.fit.viewers_fit import for_viewers, num_iterations, tuning
 from drgs.integrator.scene import make_scene, render_views
 from drgs.training.trainer import Trainer
 
@@ -71,7 +71,7 @@ def test_refined_cameras_and_colours_are_kept():
 def test_nonfinite_values_fall_back_to_the_closed_form(monkeypatch):
     trainer, _, gaussians = ended_fit(8)
     expected = viewers._closed_form(trainer, gaussians)  # private: what no iteration has changed
-    monkeypatch.setitem(viewers.RATES, "scales_lr", 10.0)
+    monkeypatch.setitem(viewers.TOUCH_UP_RATES, "scales_lr", 10.0)
     monkeypatch.setattr(viewers, "ITERATIONS_SHARE", 0.5)
     step = Trainer.step
 
