@@ -490,7 +490,10 @@ class FitConfig(ExtensibleSection):
             place = values
             if name in STRATEGIES and isinstance(densify := values.get("densify", {}), Mapping):
                 place = values["densify"] = dict(densify)
-            place[name] = section
+            newer = place.get(name)
+            if isinstance(section, Mapping) and isinstance(newer, Mapping):
+                section = {**section, **newer}
+            place[name] = newer if section is None else section
         return values
 
     @model_validator(mode="after")

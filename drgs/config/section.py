@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Optional, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Optional, TypeVar, get_args
 
 import yaml
 from pydantic import (
@@ -17,6 +17,7 @@ from pydantic import (
     model_validator,
 )
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+from pydantic_core.core_schema import ErrorType
 from typing_extensions import Self
 
 from drgs.core.constants import MAX_INT
@@ -99,7 +100,7 @@ class ExtensibleSection(Section):
         own = {k: v for k, v in values.items() if k in cls.model_fields}
         sections: dict[str, Section | None] = {}
         errors: list[ErrorDetails] = []
-        for name in values.keys() - own.keys() if len(own) < len(values) else ():
+        for name in (name for name in values if name not in own):
             try:
                 sections[name] = _validate_section(cls.extension(str(name)), name, values[name])
             except ValidationError as error:
@@ -128,11 +129,11 @@ def _validate_section(extension: Extension | None, name: str, values: object) ->
     model = extension.section
     if model is None:
         if values:
-            raise _section_error(name, "must be empty: it has no settings", values)
+            raise _section_error(name, "empty, as the extension has no settings", values)
         return None
     if not issubclass(model, Section):
         base = f"{Section.__module__}.{Section.__name__}"
-        raise _section_error(name, f"must have a model that is a subclass of {base}", values)
+        raise _section_error(name, f"of an extension whose model is a subclass of {base}", values)
     if isinstance(values, BaseModel):
         values = values.model_dump()
     try:
@@ -142,17 +143,16 @@ def _validate_section(extension: Extension | None, name: str, values: object) ->
         raise ValidationError.from_exception_data(name, found) from None
 
 
-def _section_error(name: str, problem: str, values: object) -> ValidationError:
-    is_known_type = problem == "extra_forbidden"
-    kind = problem if is_known_type else PydanticCustomError("section", "{text}", {"text": problem})
-    details = InitErrorDetails(type=kind, loc=(name,), input=values)
-    return ValidationError.from_exception_data(name, [details])
+def _section_error(name: str, kind: str, values: object) -> ValidationError:
+    error = ErrorDetails(type=kind, loc=(name,), msg=kind, input=values)
+    return ValidationError.from_exception_data(name, [_error_details(error)])
 
 
 def _error_details(error: ErrorDetails) -> InitErrorDetails:
+    """Return an error as pydantic accepts it."""
     kind = error["type"]
-    if kind == "section":
-        kind = PydanticCustomError("section", "{text}", {"text": error["msg"]})
+    if kind not in get_args(ErrorType):  # our own, or one that pydantic has in Python
+        kind = PydanticCustomError(kind, "{text}", {"text": error["msg"]})
     context = error.get("ctx", {})
     return InitErrorDetails(type=kind, loc=error["loc"], input=error["input"], ctx=context)
 
@@ -199,8 +199,6 @@ def expectation(error: ErrorDetails) -> str:
     kind, context = error["type"], error.get("ctx", {})
     if kind == "value_error":
         return str(context["error"])
-    if kind == "section":
-        return error["msg"]
     for relation, sign in _RELATIONS.items():
         if relation in context:
             return f"must be {sign} {context[relation]:.10g}"

@@ -10,7 +10,9 @@ from drgs.config.approximations import Approximations
 from drgs.config.changes import with_iterations
 from drgs.config.load import PATH_KEYS, known_keys, load_config
 from drgs.config.schema import FitConfig
+from drgs.config.section import ExtensibleSection
 from drgs.core.errors import UserError
+from drgs.training.density.adc import AdcConfig
 
 SCENES = sorted((REPOSITORY / "scenes").glob("*.yml"))
 
@@ -36,6 +38,8 @@ def fields_of(model, prefix=""):
             yield from fields_of(field.annotation, f"{prefix}{name}.")
         else:
             yield prefix + name, field
+    for extension in model.extensions() if issubclass(model, ExtensibleSection) else ():
+        yield from fields_of(extension.section, f"{prefix}{extension.name}.")
 
 
 def test_lego_paper_is_the_reference_recipe():
@@ -82,12 +86,13 @@ def test_shorter_schedule_is_scaled_in_proportion():
         iterations=30_000,
         coarse=[{"until": 3000, "factor": 2}],
         cameras={"start": 1000},
+        densify={"adc": {}},
         seed=7,
     )
     short = with_iterations(config, 6000)
     assert short.iterations == 6000 and short.seed == 7
     assert (short.densify.start, short.densify.stop, short.densify.every) == (100, 4500, 100)
-    assert short.cameras.start == 200
+    assert short.sections["cameras"].start == 200
     assert (short.densify.adc.reset_every, short.densify.adc.white_background_reset) == (600, 100)
     assert short.densify.adc.grad_threshold == config.densify.adc.grad_threshold
     assert short.model.sh_increase_every == 150 and short.coarse[0].until == 600
@@ -198,7 +203,7 @@ WRONG_FILES = [
     ("data: {path: x, background: [0, 0, 2]}", f"{BACKGROUND}[0, 0, 2]"),
     (
         "data: {path: x, type: llff}",
-        f"data.type must be one of 'auto', 'nerf_synthetic', 'nerfstudio', 'colmap'{MORE}'llff'",
+        f"data.type must be one of 'auto', 'colmap', 'nerf_synthetic', 'nerfstudio'{MORE}'llff'",
     ),
     ("data: {}", "data.path is missing: Dataset folder; relative to the configuration file."),
     ("seed: 1", "data is missing: Photographs, cameras, and how to read them."),
@@ -289,7 +294,7 @@ def test_shipped_configurations_load(scene):
 def test_last_opacity_reset_of_a_short_run_is_long_before_its_end(name):
     for overrides in ([], ["iterations=3000"], ["iterations=4300"]):
         config = load_config(REPOSITORY / "scenes" / f"{name}.yml", overrides)
-        adc = config.densify.adc
+        adc = AdcConfig()
         resets = range(adc.reset_every, config.densify.stop, adc.reset_every)
         assert config.iterations - max([*resets, adc.white_background_reset]) >= 1200
 
@@ -298,7 +303,7 @@ UNLIMITED = {"model.low_pass", "densify.adc.grad_threshold", "densify.adc.clone_
              "densify.adc.prune_scale", "densify.adc.split_shrink"}  # fmt: skip
 """Compared with, or finite in float32, however large they are."""
 
-UNFITTED = ("data.", "output.", "coarse", "extensions")
+UNFITTED = ("data.", "output.", "coarse")
 
 
 def test_every_number_of_a_fit_has_two_limits():

@@ -9,8 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from drgs.training.effects.base import TrainingEffect
-from drgs.training.findings import Finding, exposure_spread
 from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 from support.commands import assert_ends_well, assert_refused
@@ -21,6 +19,8 @@ import drgs
 from drgs.config.extensions import EFFECTS
 from drgs.config.load import config_from
 from drgs.core.registry import temporary_registrations
+from drgs.effects.base import Finding, TrainingEffect
+from drgs.effects.colors import exposure_spread
 from drgs.examine import __main__ as command
 from drgs.examine.examination import Examination, decide, given_keys, overlaps, split_views
 

@@ -3,12 +3,12 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from drgs.training.effects.base import as_tensor
-from drgs.training.effects.view_parameters import OptimisedEffect
 from pydantic import Field
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.section import Section
+from drgs.effects.base import as_tensor
+from drgs.effects.optimised import OptimisedEffect
 
 
 class VignettingSection(Section):

@@ -5,7 +5,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
-from drgs.training.effects.base import TrainingEffect
 from support.fit_command import VALUES, write_project
 from support.folders import contents
 from support.small_capture import make_dataset, write_dataset
@@ -13,6 +12,7 @@ from support.small_capture import make_dataset, write_dataset
 import drgs
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
+from drgs.effects.base import TrainingEffect
 from drgs.fit import __main__ as fit
 from drgs.fit import fit_folder
 from drgs.fit.budget import rehearse

@@ -9,12 +9,12 @@ from functools import cache
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from drgs.training.effects.base import TrainingEffect
 
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.datasets.images import compact_photograph
 from drgs.datasets.types import Dataset, View
+from drgs.effects.base import TrainingEffect
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.images import to_uint8

@@ -8,7 +8,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from drgs.training.effects.cameras import INTRINSICS
 from scipy.spatial.transform import Rotation
 from support import small_fits as fits
 from support.helpers import central_difference, single
@@ -21,6 +20,7 @@ from drgs.cameras.viewpoints import CameraMotion
 from drgs.core.errors import UserError
 from drgs.datasets.camera_file import read_viewpoints
 from drgs.datasets.images import smaller_view
+from drgs.effects.cameras import INTRINSICS
 from drgs.integrator.scene import render_views
 from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import refined_dataset

@@ -7,7 +7,6 @@ from functools import partial
 import drjit as dr
 import numpy as np
 import pytest
-from drgs.training.effects import colors, depth
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -17,6 +16,8 @@ from support.helpers import (
     single,
 )
 from support.kernels import float_reductions
+
+from drgs.effects import colors, depth
 
 HEIGHT, WIDTH = 13, 21
 

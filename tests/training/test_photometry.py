@@ -12,8 +12,8 @@ from support import small_fits as fits
 from support.helpers import central_difference, single
 from support.small_fits import photometric_loss
 
-from drgs.config.schema import ColorConfig
 from drgs.core.errors import UserError
+from drgs.effects.colors import ColorConfig
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.results.files import PHOTOMETRY
 
