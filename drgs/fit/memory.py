@@ -26,7 +26,7 @@ from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.grid import MICRO, TILE
 from drgs.splatting.reduction import BAND_SLOTS
-from drgs.training.density.strategy import density_strategy
+from drgs.training.density.phases import density_strategy
 from drgs.training.parallel.communicator import Communicator
 
 PROCESS_BYTES = 290_000_000  # memory of interpreter, libraries, compiled kernels, and results

@@ -19,7 +19,8 @@ from drgs.config.density import DensifyConfig
 from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import Gaussians
 from drgs.training import trainer as trainer_module
-from drgs.training.density.strategy import DensityReport, DensityStrategy, Phases, density_strategy
+from drgs.training.density.phases import Phases, density_strategy
+from drgs.training.density.strategy import DensityReport, DensityStrategy
 from drgs.training.rates import revised_stops
 from drgs.training.trainer import Trainer
 
