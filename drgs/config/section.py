@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Optional, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Optional, TypeVar, cast, get_args
 
 import yaml
 from pydantic import (
@@ -18,7 +18,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ErrorType
-from typing_extensions import Self
+from typing_extensions import LiteralString, Self
 
 from drgs.core.constants import MAX_INT
 from drgs.core.errors import did_you_mean, one_line
@@ -60,6 +60,9 @@ class Section(BaseModel):
         """Raise ValueError for values that do not suit others of the configuration."""
 
 
+SectionType = TypeVar("SectionType", bound=Section)
+
+
 class ExtensibleSection(Section):
     """A section that contains sections of extensions, too, under their names."""
 
@@ -71,6 +74,11 @@ class ExtensibleSection(Section):
     def sections(self) -> Mapping[str, Section | None]:
         """The sections of extensions by name; None: the extension has no settings."""
         return self.model_extra or {}
+
+    def section(self, name: str, model: type[SectionType]) -> SectionType:
+        """Return the section of an extension, by default with all defaults."""
+        found = self.sections.get(name)
+        return found if isinstance(found, model) else model.model_validate({})
 
     @classmethod
     def extension(cls, name: str) -> Extension | None:
@@ -105,11 +113,12 @@ class ExtensibleSection(Section):
                 sections[name] = _validate_section(cls.extension(str(name)), name, values[name])
             except ValidationError as error:
                 errors += error.errors()
+        result = None
         try:
             result = handler(own)
         except ValidationError as error:
             errors = [*error.errors(), *errors]
-        if errors:
+        if result is None or errors:
             details = [_error_details(error) for error in errors]
             raise ValidationError.from_exception_data(cls.__name__, details)
         ordered = {name: sections[name] for name in values if name in sections}
@@ -152,7 +161,7 @@ def _error_details(error: ErrorDetails) -> InitErrorDetails:
     """Return an error as pydantic accepts it."""
     kind = error["type"]
     if kind not in get_args(ErrorType):  # our own, or one that pydantic has in Python
-        kind = PydanticCustomError(kind, "{text}", {"text": error["msg"]})
+        kind = PydanticCustomError(cast(LiteralString, kind), "{text}", {"text": error["msg"]})
     context = error.get("ctx", {})
     return InitErrorDetails(type=kind, loc=error["loc"], input=error["input"], ctx=context)
 
@@ -170,9 +179,6 @@ def name_of(registry: Registry, *others: str) -> AfterValidator:
         return name
 
     return AfterValidator(check)
-
-
-SectionType = TypeVar("SectionType", bound=Section)
 
 
 def subsection(model: type[SectionType]) -> SectionType:

@@ -114,11 +114,6 @@ class _Start:
     size: mi.Vector2f  # px
 
 
-def cameras_of(config: FitConfig) -> CamerasConfig:
-    """Return the section ``cameras`` of a configuration, by default with all defaults."""
-    return cast(CamerasConfig, config.sections.get("cameras") or CamerasConfig())
-
-
 @EFFECTS.register("cameras", section=CamerasConfig)
 class CameraRefinement(OptimisedEffect):
     """Poses of all training views, and their lens."""
@@ -130,12 +125,12 @@ class CameraRefinement(OptimisedEffect):
     @classmethod
     @override
     def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
-        return cameras_of(config).optimise
+        return config.section("cameras", CamerasConfig).optimise
 
     @classmethod
     @override
     def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
-        rates = cameras_of(config)
+        rates = config.section("cameras", CamerasConfig)
         what = join_parts(
             "poses" if rates.rotation_lr or rates.translation_lr else None,
             "focal lengths" if rates.focal_lr else None,

@@ -76,11 +76,6 @@ class ColorConfig(Section):
         return (self.lr, self.vignetting_lr, self.response_lr) == (None, None, None)
 
 
-def colors_of(config: FitConfig) -> ColorConfig:
-    """Return the section ``colors`` of a configuration, by default with all defaults."""
-    return cast(ColorConfig, config.sections.get("colors") or ColorConfig())
-
-
 @EFFECTS.register("colors", section=ColorConfig)
 class ColorCorrection(CenteredEffect):
     """A 3 x 4 transform for each view."""
@@ -92,7 +87,7 @@ class ColorCorrection(CenteredEffect):
     @classmethod
     @override
     def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
-        return colors_of(config).lr is not None
+        return config.section("colors", ColorConfig).lr is not None
 
     @classmethod
     @override

@@ -28,7 +28,7 @@ from drgs.core.errors import UserError
 from drgs.core.files import write_json
 from drgs.core.types import Float, TensorXf
 from drgs.effects.base import SimulatedEffect, as_tensor, opacity_of
-from drgs.effects.colors import ColorConfig, colors_of
+from drgs.effects.colors import ColorConfig
 from drgs.effects.optimised import CenteredEffect
 
 if TYPE_CHECKING:
@@ -54,18 +54,18 @@ class Photometry(CenteredEffect):
     @classmethod
     @override
     def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
-        return bool(given_rates(colors_of(config)))
+        return bool(given_rates(config.section("colors", ColorConfig)))
 
     @classmethod
     @override
     def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
-        names = given_rates(colors_of(config))
+        names = given_rates(config.section("colors", ColorConfig))
         return [SimulatedEffect(n, "of each camera", f"colors.{n}_lr") for n in names]
 
     @classmethod
     @override
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> Photometry:
-        return cls(colors_of(config), dataset.train)
+        return cls(config.section("colors", ColorConfig), dataset.train)
 
     def __init__(self, config: ColorConfig, views: Sequence[View]) -> None:
         """views: the training split."""

@@ -17,7 +17,7 @@ from drgs.core.memory import available_memory, format_bytes, resident_memory
 from drgs.datasets.storage import is_on_disk
 from drgs.datasets.types import Dataset, View
 from drgs.splatting.reduction import BAND_SLOTS
-from drgs.training.density.strategy import density_strategy
+from drgs.training.density.phases import density_strategy
 from drgs.training.parallel.communicator import Communicator
 
 PROCESS_BYTES = 290_000_000  # memory of interpreter, libraries, compiled kernels, and results

@@ -24,7 +24,7 @@ from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import View
 from drgs.effects.base import TrainingEffect
-from drgs.effects.colors import colors_of
+from drgs.effects.colors import ColorConfig
 from drgs.effects.smoothing import bake_for_viewers, bake_smoothing
 from drgs.fit.inputs import share_gaussians
 from drgs.gaussians.parameters import Gaussians
@@ -120,7 +120,7 @@ def tuning(config: FitConfig) -> FitConfig:
         **{f"cameras.{name}_lr": 0.0 for name in ("rotation", "translation", "focal", "principal")},
     }
     for name in ("lr", "vignetting_lr", "response_lr"):
-        if getattr(colors_of(config), name) is not None:
+        if getattr(config.section("colors", ColorConfig), name) is not None:
             changes[f"colors.{name}"] = NEGLIGIBLE_RATE
     return with_changes(config, changes)
 

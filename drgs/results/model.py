@@ -23,7 +23,7 @@ from drgs.core.errors import PluginError, UserError, format_names
 from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets import Dataset, load_dataset
-from drgs.effects.cameras import CAMERAS, cameras_of
+from drgs.effects.cameras import CAMERAS, CamerasConfig
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import (
@@ -184,7 +184,7 @@ class Model:
         dataset = dataset.relative_to(self.gaussians.origin)
         if self.folder is None or not (path := self.folder / CAMERAS).is_file():
             return dataset
-        if not cameras_of(self.config).optimise:
+        if not self.config.section("cameras", CamerasConfig).optimise:
             print(
                 f"cameras: as the dataset has them; those of {path} are used with "
                 "--set cameras.optimise=true"

@@ -16,7 +16,7 @@ from drgs.core.origin import Origin
 from drgs.datasets.camera_file import cameras_json, read_viewpoints
 from drgs.datasets.transforms import MAX_BYTES
 from drgs.datasets.types import Dataset, View
-from drgs.effects.cameras import CAMERAS, LensChange, cameras_of
+from drgs.effects.cameras import CAMERAS, CamerasConfig, LensChange
 from drgs.results.files import VIEWS
 from drgs.results.folder import load_run_config
 
@@ -47,7 +47,7 @@ def refined_viewpoints(folder: Path, origin: Origin) -> list[Viewpoint] | None:
     origin: of their positions, world. Raises :class:`UserError` as ``read_viewpoints``.
     """
     path = folder / CAMERAS
-    if not path.is_file() or not cameras_of(load_run_config(folder)).optimise:
+    if not path.is_file() or not load_run_config(folder).section("cameras", CamerasConfig).optimise:
         return None
     return _read_relative(path, origin)
 

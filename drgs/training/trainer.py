@@ -33,12 +33,12 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.types import SplatsPlugin
 from drgs.splatting.rendering import NO_FAULT
+from drgs.training.density.phases import density_strategy
 from drgs.training.density.strategy import (
     DensityReport,
     DensityStrategy,
     PixelWeight,
     StepInfo,
-    density_strategy,
 )
 from drgs.training.finite_checks import GradientWatch, WatchedIteration, check_values
 from drgs.training.losses import Loss, make_loss, make_loss_terms

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, cast
 
 import drjit as dr
@@ -85,7 +85,7 @@ class AdaptiveDensityControl(DensityStrategy):
     """Clones and splits where gradients are large, prunes transparent and large Gaussians."""
 
     config: DensifyConfig
-    settings: AdcConfig = field(default_factory=AdcConfig)
+    settings: AdcConfig
     white_background: bool = False
     gradient_norms: Float = NOT_BEGUN  # (N,): sum over views of |d loss / d mean2d| in NDC units
     views: Float = NOT_BEGUN  # (N,): number of views in which the Gaussian was visible

@@ -17,7 +17,7 @@ Nothing is random, and ties are broken by index.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
@@ -82,7 +82,7 @@ class GrowthToNumber(DensityStrategy):
     """Splits the Gaussians with the largest errors, up to the number allowed."""
 
     config: DensifyConfig
-    settings: BudgetConfig = field(default_factory=BudgetConfig)
+    settings: BudgetConfig
     coarse: Sequence[CoarseStage] = ()
     errors: Float = NOT_BEGUN  # (N,): sum over views of s
     first: int = 0  # Gaussians at the start

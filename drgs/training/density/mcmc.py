@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
@@ -93,7 +93,7 @@ class MarkovChain(DensityStrategy):
     """Relocates transparent Gaussians, and adds noise to means."""
 
     config: DensifyConfig
-    settings: McmcConfig = field(default_factory=McmcConfig)
+    settings: McmcConfig
     extent: float = math.nan  # of the scene, world units; known when it begins
     stop_share = 5 / 7
 

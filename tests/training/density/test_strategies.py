@@ -18,12 +18,8 @@ from drgs.config import extensions
 from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import Gaussians
 from drgs.training import trainer as trainer_module
-from drgs.training.density.strategy import (
-    DensityReport,
-    DensityStrategy,
-    PhasedStrategy,
-    density_strategy,
-)
+from drgs.training.density.phases import PhasedStrategy, density_strategy
+from drgs.training.density.strategy import DensityReport, DensityStrategy
 
 
 def trainer_with(monkeypatch, strategy, **changes):
