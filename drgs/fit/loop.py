@@ -158,7 +158,7 @@ class HeldOutQuality(Observer):
 
     def __init__(self, views: Sequence[View]) -> None:
         """views: test views; none on other ranks than 0."""
-        self._views = measured_views(views)
+        self._views = evenly_spaced(views, MAX_MEASURED_VIEWS)
 
     @override
     def after_iteration(
@@ -178,11 +178,6 @@ class HeldOutQuality(Observer):
         mean = np.mean(scores) if scores else np.nan
         history.add_test_psnr(float(trainer.comm.broadcast_numbers(mean)))
         history.leave_out(time.perf_counter() - start)
-
-
-def measured_views(views: Sequence[View]) -> tuple[View, ...]:
-    """Return at most :data:`MAX_MEASURED_VIEWS` of the views, evenly spread."""
-    return evenly_spaced(views, MAX_MEASURED_VIEWS)
 
 
 def measurement_is_due(rows: Sequence[HistoryRow], iterations: int) -> bool:

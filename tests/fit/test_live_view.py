@@ -128,7 +128,7 @@ def test_fit_ended_early_equals_a_fit_of_fewer_iterations(end_at):
     )
     done = trainer.iteration
     # The request came when this iteration's end was already decided.
-    assert done == end_at + 1 == trainer.config.iterations
+    assert done == end_at + 1 == trainer.config.last_iteration
     assert history.rows[-1].iteration == done
     assert_told(screen, done, done)
     again = Trainer(trainer.config, dataset, disturbed_blobs())

@@ -30,12 +30,6 @@ def test_a_fit_is_measured_ten_times_or_every_hundred_iterations(iterations, eve
     assert [r.iteration for r in rows if r.test_psnr is not None] == expected
 
 
-def test_few_evenly_spaced_views_are_measured():
-    assert list(quality.measured_views(range(1))) == [0]
-    assert list(quality.measured_views(range(8))) == list(range(8))
-    assert list(quality.measured_views(range(25))) == [0, 3, 7, 10, 14, 17, 21, 24]
-
-
 @pytest.mark.slow
 def test_measuring_does_not_change_the_fit():
     """With densification, a filter that follows the means, and random backgrounds."""

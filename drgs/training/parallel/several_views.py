@@ -77,7 +77,6 @@ class SeveralViews:
         self.views_per_step = views_per_step
         self._exchange = SplatExchange(comm)
         self._views: list[_View] = []
-        self._num_added = 0  # views whose derivatives have been added
 
     def begin(self, views: Sequence[StepView], move_sensor: Callable[[StepView], None]) -> None:
         """Project the rows of this rank for the views of other ranks.
@@ -86,7 +85,6 @@ class SeveralViews:
         """
         size, num = self.comm.size, self.views_per_step
         self._views = [_View(view, renderer_of(view.place, num, size)) for view in views]
-        self._num_added = 0
         if size == 1:
             return
         sent = [each for each in self._views if each.renderer != self.comm.rank]
@@ -126,7 +124,6 @@ class SeveralViews:
                 for time, frame in enumerate(rendered.frames)
             ]
             each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
-        self._add_ready_views(is_end=False)
 
     def finish(self, names: Sequence[Sequence[str]]) -> list[ViewGradients]:
         """Return the gradients of all views; their sum is in the parameters now.
@@ -136,7 +133,7 @@ class SeveralViews:
         for each, weights in zip(self._views, names, strict=True):
             if each.renderer != self.comm.rank:
                 self._receive_results(each, weights)
-        self._add_ready_views(is_end=True)
+        self._add_all()
         self._exchange.finish()
         results = []
         for each in self._views:
@@ -191,19 +188,11 @@ class SeveralViews:
             sums = [self._exchange.receive_columns(each, time, 1)[0] for time in times]
             each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
 
-    def _add_ready_views(self, is_end: bool) -> None:
-        """Add the derivatives of the next groups of views that have arrived completely.
-
-        Derivatives of cameras need all ranks, and wait for the end of the step.
-        """
-        while self._num_added < len(self._views):
-            group = self._views[self._num_added :][:VIEWS_AT_ONCE]
-            is_whole = len(group) == VIEWS_AT_ONCE or is_end
-            if not (is_whole and all(each.gradients for each in group)):
-                return
+    def _add_all(self) -> None:
+        """Add the derivatives of all views to the parameters', a group at a time."""
+        for first in range(0, len(self._views), VIEWS_AT_ONCE):
+            group = self._views[first : first + VIEWS_AT_ONCE]
             if any(each.needs_camera for each in group):
-                if not is_end:
-                    return
                 for each in group:
                     self._add_with_camera(each)
             else:
@@ -212,7 +201,6 @@ class SeveralViews:
                 each.means2d = reduce(add, (gradients.means2d for gradients in each.gradients))
                 dr.eval(each.means2d)  # or it would hold all that came with it
                 each.gradients.clear()
-            self._num_added += len(group)
 
     def _add(self, group: Sequence[_View]) -> None:
         """Add the derivatives of some views to the step's."""
