@@ -188,7 +188,7 @@ def test_unexpected_errors_keep_their_tracebacks(error):
         raising(error)([])
 
 
-NAMES = [*commands.COMMANDS, *(f"bench {name}" for name in bench.COMMANDS)]
+NAMES = [*commands.commands(), *(f"bench {name}" for name in bench.COMMANDS)]
 
 
 @pytest.mark.parametrize(

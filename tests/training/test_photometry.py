@@ -14,8 +14,8 @@ from support.small_fits import photometric_loss
 
 from drgs.core.errors import UserError
 from drgs.effects.colors import ColorConfig
+from drgs.effects.photometry import PHOTOMETRY
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.results.files import PHOTOMETRY
 
 VIGNETTING = np.array([[-0.3, 0.1, -0.15], [0.05, -0.1, 0.02]])
 RESPONSE = np.array([[0.2, 0.1], [-0.2, -0.1]])  # their mean is zero
