@@ -275,7 +275,7 @@ def camera_gradients_equal_differences(case: Case) -> None:
     gaussians, frames = case.frames(case.values)
     for frame in frames:
         d_planes = [cast("Any", llvm.Float64(plane)) for plane in weights]
-        found = rendering.frames_adjoint(gaussians, [frame], [d_planes], of_camera=True).camera
+        found = rendering.frames_adjoint(gaussians, [frame], [d_planes], with_camera=True).camera
         gradient = _arrays(found or []).ravel()
         direction = single(np.random.default_rng(3).normal(size=len(gradient)))
 

@@ -17,7 +17,7 @@ from drgs.splatting.grid import TileGrid
 from drgs.splatting.projection import load_rows
 from drgs.splatting.rasterize import CompositedTiles, Records, composite, composite_adjoint
 from drgs.splatting.rendering import Pipeline, gradients_of
-from drgs.splatting.tiles import bin_footprints, footprints_of
+from drgs.splatting.tiles import bin_splats, splat_table
 
 
 class MinimalSplatsIntegrator(mi.CppADIntegrator):
@@ -76,10 +76,10 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
                 dr.traverse(dr.ADMode.Backward)
                 d_planes = dr.grad(planes)
             of_splats = composite_adjoint(tiles, d_planes)
-            found = gradients_of(self._gaussians, camera, self.pipeline, of_splats).parameters
+            gradients = gradients_of(self._gaussians, camera, self.pipeline, of_splats).parameters
         for name in PARAMETER_NAMES:
             if dr.grad_enabled(getattr(self, name)):
-                dr.accum_grad(getattr(self, name), getattr(found, name))
+                dr.accum_grad(getattr(self, name), getattr(gradients, name))
 
     @property
     def _gaussians(self) -> Gaussians:
@@ -94,7 +94,7 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         rows = load_rows(self._gaussians, self.pipeline.sh_degree)
         splats = self.pipeline.project(rows, camera)
         grid = TileGrid(camera.width, camera.height)
-        bins = bin_footprints(footprints_of(splats, grid, list(splats.colors)), grid, DEFAULT)
+        bins = bin_splats(splat_table(splats, grid, list(splats.colors)), grid, DEFAULT)
         tiles = composite(bins, Records.from_ranks(bins, bins.rows.load))
         return sensor.film(), camera, tiles
 

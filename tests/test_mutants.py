@@ -72,13 +72,13 @@ class Copies:
             board,
             footprint,
             derivatives=[
-                "FootprintModel.footprint",
-                "FootprintModel.alphas",
+                "ImageModel.footprint",
+                "ImageModel.alphas",
                 *(f"GaussianFalloff.{name}" for name in FALLOFF_DERIVATIVES),
                 *(f"PixelCenters.{name}" for name in ("sum", "sum_dx", "sum_dy", "sum_dy_dy")),
                 *(f"SplatFeatures.{name}" for name in ("add_derivatives", "tangents")),
             ],
-            forward=["FootprintModel.footprint", "FootprintModel.alphas"],
+            forward=["ImageModel.footprint", "ImageModel.alphas"],
         )
         self.falloff = Instrumented(
             board,
@@ -130,7 +130,7 @@ class Copies:
                 for name, value in vars(tiles.bins.model).items()
                 if type(value).__module__ != footprint.__name__
             }
-            bins = replace(tiles.bins, model=self.model["FootprintModel"](**given))
+            bins = replace(tiles.bins, model=self.model["ImageModel"](**given))
             return self.kernels[name](replace(tiles, bins=bins), *arguments)
 
         return run

@@ -35,7 +35,7 @@ from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import Rows, scatter_rows, types_of
 from drgs.core.types import Bool, Float, UInt32
-from drgs.splatting.footprint import Alpha, Footprint, FootprintModel, flat_columns
+from drgs.splatting.footprint import Alpha, ImageModel, MicroTileFootprint, flat_columns
 from drgs.splatting.grid import (
     PIXELS,
     Lanes,
@@ -46,7 +46,7 @@ from drgs.splatting.grid import (
     pixels_of,
 )
 from drgs.splatting.order import CenterOrder
-from drgs.splatting.projection import Projection, ProjectionModel, Splats2D, ewa
+from drgs.splatting.projection import FilmProjection, ProjectionModel, Splats2D, ewa
 from drgs.splatting.rasterize import (
     ONE_SAMPLE,
     CompositedTiles,
@@ -82,7 +82,7 @@ class PixelOrder(CenterOrder):
     @override
     def create(
         cls, projection: type[ProjectionModel], approximations: Approximations
-    ) -> tuple[Projection, PixelOrder]:
+    ) -> tuple[FilmProjection, PixelOrder]:
         shape, depths = projection.shape_with_depth, AffineDepths()
         if projection.falloff is RayFalloff:
             depths = RayDepths()
@@ -132,7 +132,7 @@ class _Crossing:
     active: Bool  # there is one
     geometry: list[Float]
     features: list[Float]
-    footprint: Footprint
+    footprint: MicroTileFootprint
     alphas: list[Alpha]
 
 
@@ -145,7 +145,7 @@ class _WalkInputs:
     lists: PixelLists
     order: PixelOrder
     lanes: Lanes
-    model: FootprintModel  # bound to the lanes
+    model: ImageModel  # bound to the lanes
     samples: range  # of the lanes
 
     @staticmethod

@@ -102,7 +102,7 @@ def stage_clock() -> Iterator[StageClock]:
 
     borders = [
         (tiles, "_store_rows", None, "projection and SH"),
-        (rendering, "bin_footprints", None, "binning"),
+        (rendering, "bin_splats", None, "binning"),
         (rendering, "composite", None, "compositing"),
         (rendering, "composite_adjoint", "image and loss", None),
         (rasterize, "sum_entries", "adjoint", "reduction"),

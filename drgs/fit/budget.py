@@ -4,7 +4,7 @@
 :class:`Strategy`, in the time of an iteration at the start of a fit, with full images and the first
 Gaussians. A rehearsal of the planned fit converts it to seconds, and the strategy whose curve is
 highest at the deadline is chosen. Curves of another scene predict a time to some ten or twenty per
-cent, so the clock ends the fit (:func:`until`): it cuts the last phase, when rates are small,
+cent, so the clock ends the fit (:func:`deadline`): it cuts the last phase, when rates are small,
 or appends iterations at the final rates. The resulting configuration gives the same bytes without a
 clock.
 """
@@ -305,7 +305,7 @@ def plan_fit(
     return replace(plan, end=end)
 
 
-def until(end: float, comm: Communicator) -> Continues:
+def deadline(end: float, comm: Communicator) -> Continues:
     """Let a fit run until ``end``, by ``time.perf_counter`` of rank 0."""
 
     def is_time_left(trainer: Trainer) -> bool:

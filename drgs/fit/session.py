@@ -31,7 +31,7 @@ from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.folders import config_for
 from drgs.effects.base import Examination, Examiner, TrainingEffect
-from drgs.fit.budget import REHEARSAL_SHARE, Budget, Plan, plan_fit, rehearse, until
+from drgs.fit.budget import REHEARSAL_SHARE, Budget, Plan, deadline, plan_fit, rehearse
 from drgs.fit.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.fit.fingerprint import Fingerprint, fingerprint_of
 from drgs.fit.fit_folder import FitFolder, saved_gaussians
@@ -135,7 +135,7 @@ class FitSession:
                 if self.examination is not None:
                     folder.write_examination(self.examination)
             if plan is not None:
-                self.continues = until(plan.end, self.comm)
+                self.continues = deadline(plan.end, self.comm)
                 if folder is not None and self.budget is not None:
                     folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
             self.on_start(self)

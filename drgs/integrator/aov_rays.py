@@ -22,7 +22,7 @@ from drgs.integrator.sensors import camera_from_sensor, is_batch, read_sensor
 from drgs.integrator.state import SplatsState
 
 if TYPE_CHECKING:  # imported where a scene has surfaces
-    from drgs.integrator.surfaces import NestedSurfaces
+    from drgs.integrator.light.surfaces import NestedSurfaces
 
 NESTED_VIEW = -1  # index of the view in the cache
 PIXEL_MARGIN_PX = 1 / 16  # largest distance of a ray from its pixel; float32 finds it to 1e-3 px

@@ -4,14 +4,14 @@ An :class:`ImageRender` has a :class:`SensorRender` for each sensor of a ``batch
 renders a frame (``drgs.splatting.rendering``) for each time of the shutter and each pass of
 samples, or reuses those of the last image, composites them over the background and adds the
 surfaces. The film develops the channels (``drgs.integrator.film``), and a nested integrator's image
-of surfaces is inserted (``drgs.integrator.surfaces``).
+of surfaces is inserted (``drgs.integrator.light.surfaces``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 from itertools import chain, repeat
 from typing import TYPE_CHECKING
 
@@ -24,7 +24,7 @@ from drgs.core.memory import MAX_LANES, UNASKED_BYTES, available_memory, too_lar
 from drgs.core.types import Float
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.film import CenterSamples, Channels, sample_offsets
+from drgs.integrator.film import CenterSamples, Channels, decode, sample_offsets
 from drgs.integrator.sensors import (
     SensorState,
     accumulate_in_sensor,
@@ -40,12 +40,12 @@ from drgs.integrator.state import Cached, ProjectedView, SplatsState, surfaces_i
 from drgs.splatting import rendering
 from drgs.splatting.footprint import SamplePositions
 from drgs.splatting.rasterize import SplatGradients
-from drgs.splatting.tiles import Footprints
+from drgs.splatting.tiles import SplatTable
 
 if TYPE_CHECKING:  # imported where a scene requires them
+    from drgs.integrator.light.surfaces import NestedSurfaces
+    from drgs.integrator.light.visible_surfaces import SurfaceLayers
     from drgs.integrator.sensors import SideBySide
-    from drgs.integrator.surfaces import NestedSurfaces
-    from drgs.integrator.visible_surfaces import SurfaceLayers
 
 
 Passes = list[Channels]  # channels by pass: one sample per pixel or, on a small film, several
@@ -75,7 +75,8 @@ class ImageRender:
         film, spp = sensor.film(), spp or sensor.sampler().sample_count()
         poses = 1 if "motion" in splats.ignore else max(map(num_poses, sensors_of(sensor)))
         nested_spp = 0 if nested is None else nested.spp or spp
-        size = *film.crop_size(), spp, poses, len(names), nested_spp
+        width, height = film.crop_size()
+        size = width, height, spp, poses, len(names), nested_spp
         splats.cache.find("size", size, (), lambda: check_image(*size))
         maps = splats.cache.film_maps
         if spp == 1 and film.rfilter().is_box_filter():
@@ -141,7 +142,7 @@ class ImageRender:
         """Leave derivatives with respect to splats that were projected beforehand in these."""
         (view,) = self.views
         projected.gradients = view.splats_backward(self.samples.adjoint(grad_in))
-        projected.frames = [frame for frame, *_ in view.frames()]
+        projected.frames = [frame for frame, *_ in view.frames]
 
     def tangent(self, params: object, tangents: Gaussians) -> mi.TensorXf:
         """Return the directional derivative; tangents: of the Gaussians."""
@@ -181,7 +182,7 @@ def nested_surfaces(
     """Return the surfaces in an image; None where the scene has none."""
     if not surfaces_in(scene):
         return None
-    from drgs.integrator.surfaces import NestedSurfaces
+    from drgs.integrator.light.surfaces import NestedSurfaces
 
     return NestedSurfaces.from_scene(splats, scene, sensor, seed, spp)
 
@@ -236,11 +237,11 @@ class SensorRender:
 
     def planes(self) -> Planes:
         """Return the planes of all frames, unevaluated."""
-        return [[frame.planes() for frame in of_time] for of_time in self.frames()]
+        return [[frame.planes() for frame in of_time] for of_time in self.frames]
 
     def plane_tangents(self, tangents: Gaussians) -> Planes:
         """Return tangents of planes along those of the Gaussians and of the sensor."""
-        frames = self.frames()
+        frames = self.frames
         with dr.resume_grad():
             d_cameras = self._camera_tangents(len(frames))
         return [
@@ -253,10 +254,10 @@ class SensorRender:
         d_planes = self._planes_backward(d_channels)
         with dr.resume_grad():
             state = self._state()
-            of_camera = state.is_attached
+            is_attached = state.is_attached
         by_time = [
-            rendering.frames_adjoint(self.splats.gaussians, *of_time, of_camera)
-            for of_time in zip(self.frames(), d_planes, strict=True)
+            rendering.frames_adjoint(self.splats.gaussians, *of_time, is_attached)
+            for of_time in zip(self.frames, d_planes, strict=True)
         ]
         of_cameras = [gradients.camera for gradients in by_time if gradients.camera]
         if of_cameras:
@@ -269,7 +270,7 @@ class SensorRender:
         d_planes = self._planes_backward(d_channels)
         return [
             rendering.splats_adjoint(*of_time)
-            for of_time in zip(self.frames(), d_planes, strict=True)
+            for of_time in zip(self.frames, d_planes, strict=True)
         ]
 
     def _planes_backward(self, d_channels: Passes) -> Planes:
@@ -299,10 +300,10 @@ class SensorRender:
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
         """Return the mean over times of each pass's channels; constant: the background."""
         behind = self._render_behind(constant)
-        seen = repeat(repeat(None))
+        layers = repeat(repeat(None))
         if self.nested is not None:
-            seen = self._traced_surfaces(self.nested, self._state().detach()).value
-        by_time = zip(planes, seen, behind.colors, behind.radiance, strict=False)
+            layers = self._traced_surfaces(self.nested).value
+        by_time = zip(planes, layers, behind.colors, behind.radiance, strict=False)
         channels = [
             [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
             for time in by_time
@@ -320,7 +321,7 @@ class SensorRender:
         """Return a sample's channels; layers: visible surfaces, None in a scene without any."""
         if layers is None:
             return self._to_channels(planes, mi.Float(1), behind, color)
-        from drgs.integrator.visible_surfaces import transmittance_behind
+        from drgs.integrator.light.visible_surfaces import transmittance_behind
 
         planes, fronts = planes[: -len(layers)], planes[-len(layers) :]
         pairs = list(zip(layers, fronts, strict=True))
@@ -330,13 +331,13 @@ class SensorRender:
 
         def of_surfaces(kind: str) -> Channels | None:
             values = [surface.aov_values(kind, front) for surface, front in pairs]
-            found = [of_surface for of_surface in values if of_surface is not None]
-            return [_sum(terms) for terms in zip(*found, strict=True)] if found else None
+            terms = [value for value in values if value is not None]
+            return [_sum(columns) for columns in zip(*terms, strict=True)] if terms else None
 
         past = [transmittance_behind(layers) * planes[0], *planes[1:]]
-        own = self._to_channels(past, whole, behind, color, of_surfaces)
+        channels = self._to_channels(past, whole, behind, color, of_surfaces)
         assert self.nested is not None, "its surfaces are the layers"
-        return own + self.nested.compositor.values(layers, fronts, radiance)
+        return channels + self.nested.compositor.values(layers, fronts, radiance)
 
     def _to_channels(
         self,
@@ -382,7 +383,7 @@ class SensorRender:
         behind = splats.background if environment is None else environment
         assert isinstance(behind, (mi.Emitter, mi.Texture)), "a colour would be constant"
         state = self._state()
-        cameras = [of_time[0].camera for of_time in self.frames()]
+        cameras = [of_time[0].camera for of_time in self.frames]
         if state.is_attached:
             cameras = self._attached_cameras(state)
         from drgs.integrator.background import background_radiance
@@ -392,16 +393,17 @@ class SensorRender:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Background(colors, environment is not None, radiance)
 
+    @cached_property
     def frames(self) -> list[list[rendering.Frame]]:
-        """Return frames by time and by pass, from the cache where nothing has changed."""
+        """Frames by time and by pass, from the cache where nothing has changed."""
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
-        state = self._state().detach()
-        traced = None if self.nested is None else self._traced_surfaces(self.nested, state)
+        state = self._detached
+        traced = None if self.nested is None else self._traced_surfaces(self.nested)
         key = (pipeline, self.key, *state.settings, traced), (gaussians, state.device)
 
         def render_all() -> list[list[rendering.Frame]]:
             surfaces = repeat(None) if traced is None else traced.value
-            projected = self.splats.projected
+            projected = self.splats.projected_view
             splats = repeat(None) if projected is None else projected.splats
             by_time = zip(self._cameras(state), surfaces, splats, strict=False)
             return [
@@ -417,7 +419,7 @@ class SensorRender:
         camera: Camera,
         pipeline: rendering.Pipeline,
         surfaces: Sequence[SurfaceLayers] | None,
-        splats: Footprints | None,
+        splats: SplatTable | None,
     ) -> list[rendering.Frame]:
         """Render a frame for each pass.
 
@@ -439,11 +441,10 @@ class SensorRender:
             frame = rendering.render_splats(splats, camera, pipeline)
         return [frame, *(rendering.render_again(frame, model) for model in others)]
 
-    def _traced_surfaces(
-        self, nested: NestedSurfaces, state: SensorState
-    ) -> Cached[list[list[SurfaceLayers]]]:
-        from drgs.integrator.visible_surfaces import trace_surfaces
+    def _traced_surfaces(self, nested: NestedSurfaces) -> Cached[list[list[SurfaceLayers]]]:
+        from drgs.integrator.light.visible_surfaces import trace_surfaces
 
+        state = self._detached
         hides, (_, far) = self.splats.hide_emitters, depth_range(self.sensor)
         settings = nested.surfaces, self.key, hides, far, *state.settings
         return self.splats.cache.find(
@@ -462,7 +463,7 @@ class SensorRender:
 
     def num_surfaces(self, nested: NestedSurfaces) -> int:
         """Return the number of surfaces that are seen one through the other."""
-        return len(self._traced_surfaces(nested, self._state().detach()).value[0][0])
+        return len(self._traced_surfaces(nested).value[0][0])
 
     @property
     def _offsets(self) -> list[tuple[Float | float, Float | float]]:
@@ -470,6 +471,10 @@ class SensorRender:
 
     def _state(self) -> SensorState:
         return read_sensor(self.sensor, self.splats.near)
+
+    @cached_property
+    def _detached(self) -> SensorState:
+        return self._state().detach()
 
     def _cameras(self, state: SensorState) -> list[Camera]:
         camera = without_effects(camera_from_sensor(state), self.splats.ignore)
@@ -513,11 +518,6 @@ class _Background:
     colors: Iterable[Iterable[mi.Color3f]]  # by time and by pass; display space, or see below
     is_radiance: bool  # an environment: covers the film; its colours are linear where channels are
     radiance: Iterable[Iterable[mi.Color3f | None]]  # linear, of an environment or a texture
-
-
-def decode(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
-    """Return linear radiance A D(C / A); color: C, display space; coverage: A, sum of weights."""
-    return coverage * mi.math.srgb_to_linear(color / dr.select(coverage > 0, coverage, 1))
 
 
 def constant_background(splats: SplatsState) -> mi.Color3f | None:

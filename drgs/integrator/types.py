@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         ignore: Sequence[str]
         pipeline: Pipeline
         last: BackwardResult  # after a backward pass
-        projected: ProjectedView | None
+        projected_view: ProjectedView | None
 
         def forget_frames(self) -> None:
             """Clear the cached frames."""

@@ -23,7 +23,7 @@ from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.types import Bool, Float, UInt32
 from drgs.splatting.footprint import FeatureGroup
-from drgs.splatting.projection import Projection, ProjectionModel, Splats2D
+from drgs.splatting.projection import FilmProjection, ProjectionModel, Splats2D
 from drgs.splatting.rasterize import (
     ONE_SAMPLE,
     CompositedTiles,
@@ -44,7 +44,7 @@ class CenterOrder:
     @classmethod
     def create(
         cls, projection: type[ProjectionModel], approximations: Approximations
-    ) -> tuple[Projection, CenterOrder]:
+    ) -> tuple[FilmProjection, CenterOrder]:
         """Return the projection, extended by the inputs of the order, and the order."""
         del approximations
         return projection.shape, cls()

@@ -170,7 +170,7 @@ class Records:
 def composite(bins: TileBins, records: Records) -> CompositedTiles:
     """Composite the features of all splats.
 
-    bins: from ``bin_footprints``; records: ``Records.from_ranks(bins, bins.rows.load)``.
+    bins: from ``bin_splats``; records: ``Records.from_ranks(bins, bins.rows.load)``.
     """
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
@@ -222,10 +222,11 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
     columns[:PIXELS] = [dr.abs(T) for T in columns[:PIXELS]]
     ends = [ends[pixel] for pixel in range(PIXELS)]
     dr.eval(columns, ends)
-    values = scatter_rows(columns, lanes.micro_tile, size)
-    ends, stop = (scatter_rows(x, lanes.micro_tile, size) for x in (ends, [largest(ends)]))
-    dr.eval(values, ends, stop)
-    return CompositedTiles(bins, records, values, ends, stop, count)
+    values, by_pixel, by_lane = (
+        scatter_rows(each, lanes.micro_tile, size) for each in (columns, ends, [largest(ends)])
+    )
+    dr.eval(values, by_pixel, by_lane)
+    return CompositedTiles(bins, records, values, by_pixel, by_lane, count)
 
 
 def sign_bits(value: Float) -> Int32:

@@ -1,6 +1,6 @@
 """Binning: lists of the splats that touch each tile, front to back, and iteration over them.
 
-The second stage: ``Splats2D`` -> ``Footprints`` -> ``TileBins``. The image is divided into tiles of
+The second stage: ``Splats2D`` -> ``SplatTable`` -> ``TileBins``. The image is divided into tiles of
 16x16 pixels, each a 4x4 grid of micro-tiles of 4x4 pixels. Every (splat, tile) pair of a splat's
 bounding box is one *entry*, with a mask of 16 bits for the micro-tiles that its ellipse touches. No
 lane loops over a splat's tiles, so a giant splat does not delay its neighbours, and the host reads
@@ -31,7 +31,7 @@ from drgs.core.arrays import Rows, interleave, reinterpret, types_of
 from drgs.core.errors import UserError
 from drgs.core.private import access_all_lanes, bucket_order
 from drgs.core.types import Bool, Float, UInt32
-from drgs.splatting.footprint import DEFAULT, FootprintModel
+from drgs.splatting.footprint import DEFAULT, ImageModel
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid
 from drgs.splatting.projection import Splats2D
 
@@ -60,7 +60,7 @@ class TileBins:
     tile_start: UInt32  # (tiles + 1,): tile -> first sorted entry
     num_entries: int  # M
     grid: TileGrid
-    model: FootprintModel
+    model: ImageModel
 
     @property
     def num_sums(self) -> int:
@@ -69,7 +69,7 @@ class TileBins:
 
 
 @dataclass(frozen=True)
-class Footprints:
+class SplatTable:
     """The stored inputs of binning and compositing: a row per splat.
 
     Concatenated rows of several objects are binned as if they had been projected together, because
@@ -83,32 +83,32 @@ class Footprints:
     num_keys: int
 
 
-def footprints_of(
+def splat_table(
     splats: Splats2D,
     grid: TileGrid,
     features: Sequence[Float] = (),
-    model: FootprintModel = DEFAULT,
+    model: ImageModel = DEFAULT,
     keys: Sequence[Float] = (),
-) -> Footprints:
+) -> SplatTable:
     """Store ``splats`` for binning, evaluated.
 
     features: columns, Float (N,) each, to composite; keys: further columns, for the order. Neither
     they nor the splats need to be evaluated: the kernel that computes them stores the rows.
     """
     boxes, rows, depths = _store_rows(splats, grid, [*features, *keys], model)
-    return Footprints(boxes, rows, depths, len(features), len(keys))
+    return SplatTable(boxes, rows, depths, len(features), len(keys))
 
 
-def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel) -> TileBins:
+def bin_splats(table: SplatTable, grid: TileGrid, model: ImageModel) -> TileBins:
     """Distribute splats over the tiles of ``grid``, front to back.
 
     Not differentiated. The host reads one value, the number of entries.
 
     Raises UserError if there are more than 2^26 Gaussians.
     """
-    boxes, rows, depths = footprints.boxes, footprints.rows, footprints.depths
-    num_features, num_keys = footprints.num_features, footprints.num_keys
-    del footprints  # releases its arrays before the function ends
+    boxes, rows, depths = table.boxes, table.rows, table.depths
+    num_features, num_keys = table.num_features, table.num_keys
+    del table  # releases its arrays before the function ends
     t = types_of(type(depths))
     if dr.width(depths) > 1 << _RANK_BITS:
         raise UserError(
@@ -159,7 +159,7 @@ def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel
 
 
 def _store_rows(
-    splats: Splats2D, grid: TileGrid, stored: Sequence[Float], model: FootprintModel
+    splats: Splats2D, grid: TileGrid, stored: Sequence[Float], model: ImageModel
 ) -> tuple[Rows, Rows, Float]:
     """Return, by Gaussian, boxes of tiles, all other numbers, and depths to sort by; evaluated."""
     geometry = model.falloff.geometry(splats)
@@ -172,7 +172,7 @@ def _store_rows(
     return boxes, rows, depths
 
 
-def _reach(geometry: list[Float], grid: TileGrid, model: FootprintModel) -> Float:
+def _reach(geometry: list[Float], grid: TileGrid, model: ImageModel) -> Float:
     """Return |U d|^2 (base 2) at which a splat ends, with a margin for rounding.
 
     For the default cut-offs, sqrt(2 ln(opacity / alpha_cut)) standard deviations: the
@@ -184,7 +184,7 @@ def _reach(geometry: list[Float], grid: TileGrid, model: FootprintModel) -> Floa
 
 
 def _tile_box(
-    splats: Splats2D, geometry: list[Float], grid: TileGrid, model: FootprintModel
+    splats: Splats2D, geometry: list[Float], grid: TileGrid, model: ImageModel
 ) -> list[Float]:
     """Return first column and row, columns, and number of tiles: integers, exact up to 2^24."""
     t = types_of(type(splats.depths))
@@ -239,7 +239,7 @@ def _make_entries(
     rows: Rows,
     num_entries: int,
     grid: TileGrid,
-    model: FootprintModel,
+    model: ImageModel,
 ) -> tuple[UInt32, UInt32]:
     """Return the tile of each entry, and two words: see :func:`_pack`.
 
@@ -282,7 +282,7 @@ def _pack(rank: UInt32, tile: UInt32, mask: UInt32) -> list[UInt32]:
     """Pack an entry into two words: 26 bits of rank, 22 of tile, 16 of mask.
 
     2^22 tiles have 2^30 pixels; four planes of them exceed an array of Dr.Jit. More ranks are
-    refused by :func:`bin_footprints`.
+    refused by :func:`bin_splats`.
     """
     return [rank | ((tile >> MICROS) << _RANK_BITS), mask | (tile << MICROS)]
 
@@ -303,7 +303,7 @@ def stable_order(keys: UInt32, bound: int) -> UInt32:
 
 
 def _touched_micros(
-    geometry: list[Float], tile_x: UInt32, tile_y: UInt32, grid: TileGrid, model: FootprintModel
+    geometry: list[Float], tile_x: UInt32, tile_y: UInt32, grid: TileGrid, model: ImageModel
 ) -> UInt32:
     """Return a mask: bit m is set if the ellipse alpha >= cut reaches a pixel of micro-tile m.
 

@@ -6,7 +6,7 @@ A phase trains on images of one size. A step ends with one change of the Gaussia
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import chain, islice
@@ -23,8 +23,6 @@ from drgs.effects.base import TrainingEffect
 from drgs.integrator.scene import make_sensors
 from drgs.integrator.types import SplatsPlugin
 from drgs.training.losses import TARGET_BYTES
-from drgs.training.parallel.communicator import Communicator
-from drgs.training.parallel.population import own_views
 from drgs.training.rates import LearningRates
 from drgs.training.views import TrainingView
 
@@ -105,9 +103,8 @@ NUM_AHEAD = 2  # views that are read besides that of the iteration
 class ReadAhead:
     """Reads the next photographs that a process renders, if they are on disk, in a thread."""
 
-    def __init__(self, views: Sequence[View], views_per_step: int, comm: Communicator) -> None:
-        """views: the training views."""
-        own = own_views(len(views), views_per_step, comm.rank, comm.size)
+    def __init__(self, views: Sequence[View], own: Collection[int]) -> None:
+        """views: the training views; own: indices of those that this process renders."""
         self._own = {index for index in own if is_on_disk(views[index])}
         self._thread = ThreadPoolExecutor(1, "read-ahead")  # starts with its first task
 

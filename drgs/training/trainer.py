@@ -43,7 +43,12 @@ from drgs.training.density.strategy import (
 from drgs.training.finite_checks import GradientWatch, WatchedIteration, check_values
 from drgs.training.losses import Loss, make_loss, make_loss_terms
 from drgs.training.parallel.communicator import Communicator
-from drgs.training.parallel.population import check_shardable, local_gaussians, make_population
+from drgs.training.parallel.population import (
+    check_shardable,
+    local_gaussians,
+    make_population,
+    own_views,
+)
 from drgs.training.rates import rates_over_time
 from drgs.training.steps import (
     MAX_TARGET_BYTES,
@@ -135,7 +140,8 @@ class Trainer:
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)
         self.phases = make_phases(dataset.train, config, self.effects, room)
-        self.read_ahead = ReadAhead(dataset.train, views_per_step, comm)
+        own = own_views(len(dataset.train), views_per_step, comm.rank, comm.size)
+        self.read_ahead = ReadAhead(dataset.train, own)
         self.gradients: OneView | SeveralViews = OneView(self.integrator)
         if views_per_step > 1:
             from drgs.training.parallel.several_views import SeveralViews

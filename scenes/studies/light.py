@@ -59,7 +59,7 @@ class LightMode:
 LIGHT_MODES = (
     LightMode("none", {"light": "none"}),
     LightMode("probe", {"light": "probe"}),
-    LightMode("probe, unseen by rays", {"light": "probe", "unseen": "rays"}),
+    LightMode("probe, unseen by rays", {"light": "probe", "probe_fallback": "rays"}),
     LightMode("rays", {"light": "rays"}),
 )
 

@@ -79,9 +79,9 @@ def small_scene():
 
 def test_an_iteration_is_profiled(small_scene):
     """Every kernel of it belongs to a stage."""
-    before = rendering.bin_footprints
+    before = rendering.bin_splats
     report = speed.profile_training(small_scene, rounds=2)
-    assert rendering.bin_footprints is before
+    assert rendering.bin_splats is before
     assert report.wall_ms > 0 and report.kernel_ms > 0
     assert set(report.num_kernels) == set(timing.STAGES)
     assert all(count > 0 for count in report.num_kernels.values())

@@ -90,7 +90,7 @@ def quick(monkeypatch):
     plan = partial(SimpleNamespace, reasons="planned", chosen=Mock(), end=0.0)
     monkeypatch.setattr(session, "plan_fit", lambda config, *_: plan(config=config))
     monkeypatch.setattr(session, "rehearse", lambda *_, **__: (Mock(), 1.0))
-    monkeypatch.setattr(session, "until", lambda *_: lambda trainer: trainer.iteration < LAST)
+    monkeypatch.setattr(session, "deadline", lambda *_: lambda trainer: trainer.iteration < LAST)
 
 
 def assert_as_uninterrupted(folder, projects):

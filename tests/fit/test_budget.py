@@ -16,7 +16,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.fit import __main__ as fit
 from drgs.fit import budget as plan
-from drgs.fit.budget import Curve, Strategy, load_curves, make_plan, parse_duration, until
+from drgs.fit.budget import Curve, Strategy, deadline, load_curves, make_plan, parse_duration
 from drgs.fit.loop import History, iterations
 
 
@@ -147,7 +147,7 @@ def test_clock_ends_a_fit_and_its_configuration_gives_the_same_bytes(monkeypatch
     clock.perf_counter = lambda: clock.now
     monkeypatch.setattr(plan, "time", clock)
     trainer = make_trainer(iterations=6)
-    for done in iterations(trainer, History(), until(100.0 + last, trainer.comm)):
+    for done in iterations(trainer, History(), deadline(100.0 + last, trainer.comm)):
         clock.now += 1.0
         assert done.is_last == (trainer.iteration == last + 1)
     assert trainer.config.iterations == 6 and trainer.config.last_iteration == last + 1
@@ -159,8 +159,8 @@ def test_clock_ends_a_fit_and_its_configuration_gives_the_same_bytes(monkeypatch
 
 @pytest.mark.parametrize("is_time_left", [True, False])
 def test_other_ranks_follow_the_clock_of_rank_0(is_time_left):
-    deadline = until(0.0, SimpleNamespace(broadcast_numbers=lambda own: is_time_left))
-    assert deadline(SimpleNamespace(iteration=3)) == is_time_left
+    continues = deadline(0.0, SimpleNamespace(broadcast_numbers=lambda own: is_time_left))
+    assert continues(SimpleNamespace(iteration=3)) == is_time_left
 
 
 @pytest.mark.slow

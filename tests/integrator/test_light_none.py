@@ -67,7 +67,8 @@ def test_light_has_no_effect_without_surfaces():
     """The property makes no kernel of its own, and no difference."""
     tensors = gaussians()
     plain = kernels_and_bytes(tensors, {})
-    assert kernels_and_bytes(tensors, {}, light="rays", exposure=3.0, light_samples=0) == plain
+    lit = {"light": "rays", "radiance_scale": 3.0, "light_samples": 0}
+    assert kernels_and_bytes(tensors, {}, **lit) == plain
     assert kernels_and_bytes(tensors, {}, light="rays", nested={"type": "splatpath"}) == plain
     # An environment sends light, but it has no surface to send it to.
     sky = {"sky": {"type": "constant"}}

@@ -82,7 +82,7 @@ def test_rays_unknown_to_a_probe_are_empty_or_traced():
     splats = splatting.Gaussians(**{k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
     settings = {"spp": 4, **mirror_ball()}
     found = {
-        unseen: render(splats, light="probe", probes="ball", unseen=unseen, **settings)
+        unseen: render(splats, light="probe", probes="ball", probe_fallback=unseen, **settings)
         for unseen in ("none", "rays")
     }
     np.testing.assert_array_equal(found["rays"], render(splats, light="rays", **settings))
@@ -135,8 +135,8 @@ def test_invalid_probe_settings_are_refused():
 
     with pytest.raises(RuntimeError, match="probes must be ids of shapes and emitters, got none"):
         scene()
-    with pytest.raises(RuntimeError, match="unseen must be one of none, rays, got 'guess'"):
-        scene(probes="ball", unseen="guess")
+    with pytest.raises(RuntimeError, match="probe_fallback must be one of none, rays, got 'guess'"):
+        scene(probes="ball", probe_fallback="guess")
     for name, message in (("bowl", "got 'bowl'; there are sky, ball"), ("sky", "infinitely far")):
         found = scene(probes=f"ball, {name}")
         with pytest.raises(PluginError, match=message):

@@ -157,7 +157,7 @@ class Furnace:
             gaussians(np.zeros((2, 3)), 1e3, self.alpha, self.color),
             max_depth=max_depth,
             light_samples=self.light_samples,
-            exposure=self.exposure,
+            radiance_scale=self.exposure,
             spp=64,
             wall=wall,
             lamp={"type": "point", "position": [0, 0, self.LAMP], "intensity": np.pi},

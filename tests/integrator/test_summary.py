@@ -26,9 +26,9 @@ MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
     "cameras.radial_tangential",
     "cameras.thin_prism_fisheye", "effects.defocus", "effects.occlusion",
-    "effects.smoothing", "gaussians.rotation", "gaussians.similarity", "integrator.gathering",
+    "effects.smoothing", "gaussians.rotation", "gaussians.similarity", "integrator.parts",
     "integrator.light.splat_transport", "integrator.light.shadows",
-    "integrator.surfaces",
+    "integrator.light.surfaces",
     "light", "light.grid", "light.probe", "light.walk",
 )  # fmt: skip
 """Modules used only by effects of images; a fit asks every effect whether it takes part."""
@@ -292,7 +292,7 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "distorted": ["drgs.cameras.distortion", "drgs.cameras.radial_tangential"],
         "thin lens": ["drgs.effects.defocus"],
         "orthographic": ["drgs.cameras.orthographic"],
-        "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
+        "surface": ["drgs.effects.occlusion", "drgs.integrator.light.surfaces"],
         "path": [],
         "splatpath": [],
         "light": [
@@ -306,6 +306,6 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "object in its place": [
             "drgs.gaussians.rotation",
             "drgs.gaussians.similarity",
-            "drgs.integrator.gathering",
+            "drgs.integrator.parts",
         ],
     }

@@ -16,10 +16,9 @@ from drgs.core.arrays import from_host
 from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
-from drgs.splatting import rendering
+from drgs.splatting import rendering, tiles
 from drgs.splatting.footprint import DEFAULT
 from drgs.splatting.projection import compensated_opacity, plain_opacity
-from drgs.splatting.tiles import bin_footprints, footprints_of
 
 NEAR_THRESHOLD = 1e-4
 """Relative distance from a threshold at which float32 may decide otherwise. A mean at p px carries
@@ -420,4 +419,4 @@ def bitwise(tree) -> list[bytes]:
 
 def bin_splats(splats, grid, features=(), model=DEFAULT):
     """From projected splats to tiles, without keys."""
-    return bin_footprints(footprints_of(splats, grid, features, model), grid, model)
+    return tiles.bin_splats(tiles.splat_table(splats, grid, features, model), grid, model)

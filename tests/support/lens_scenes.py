@@ -320,7 +320,7 @@ def case_of(name, **others) -> LensCase:
 
 
 def splats_of(gaussians, camera, lens, precision, shape=ewa, low_pass=0.3, degree=0):
-    """Projected by the kernels."""
+    """DirectProjection by the kernels."""
     parameter_rows = load_rows(device_gaussians(gaussians, precision), degree)
     camera = lens_camera(camera, lens, precision)
     return project(parameter_rows, camera, degree, plain_opacity, shape, low_pass=low_pass)

@@ -25,8 +25,8 @@ def gaussians(means, scale=0.3, opacity=0.9, color=1.0) -> splatting.Gaussians:
 
 
 SETTINGS = (
-    *("light_samples", "exposure", "probes", "unseen", "shadows", "aovs", "smoothing"),
-    *("alpha_max", "alpha_cut"),
+    *("light_samples", "radiance_scale", "probes", "probe_fallback", "shadows"),
+    *("aovs", "smoothing", "alpha_max", "alpha_cut"),
 )
 """Integrator settings accepted by :func:`scene_of`."""
 

@@ -1,1 +1,1 @@
-"""Light between splats and surfaces, on Mitsuba's side: rays, transport, mirrors and shadows."""
+"""Surfaces among splats and light between the two, on Mitsuba's side; imported on demand."""

@@ -17,7 +17,7 @@ import numpy as np
 from drgs.core.arrays import Rows, block_widths, types_of
 from drgs.core.constants import MAX_SHUTTER_SAMPLES
 from drgs.core.types import Float, UInt32
-from drgs.splatting.tiles import Footprints
+from drgs.splatting.tiles import SplatTable
 from drgs.training.parallel.communicator import Communicator, wait
 from drgs.training.parallel.local_splats import Blocks, LocalSplats, concatenate, empty_blocks
 from drgs.training.steps import StepView
@@ -41,7 +41,7 @@ class SplatExchange:
         self.comm = comm
         self._sending: list[tuple[Any, np.ndarray]] = []  # requests and their data
 
-    def pack(self, shared: SharedView, splats: Sequence[Footprints]) -> list[Blocks]:
+    def pack(self, shared: SharedView, splats: Sequence[SplatTable]) -> list[Blocks]:
         """Return this rank's visible splats of a view, by time; the host reads their number."""
         shared.rows = [cast(UInt32, dr.compress(local.visible)) for local in shared.local]
         by_time = zip(shared.local, splats, shared.rows, strict=True)
@@ -64,7 +64,7 @@ class SplatExchange:
             for time, blocks in enumerate(packed.get(shared, ())):
                 self._send(blocks, shared.renderer, shared, time)
 
-    def receive_splats(self, shared: SharedView, time: int, own: Footprints) -> Footprints:
+    def receive_splats(self, shared: SharedView, time: int, own: SplatTable) -> SplatTable:
         """Return the splats of all ranks, behind one another; own: of this rank, the renderer."""
         local, parts = shared.local[time], []
         for rank in range(self.comm.size):
@@ -73,7 +73,7 @@ class SplatExchange:
             elif (count := int(shared.counts[rank, time])) > 0:
                 blocks = empty_blocks(count, local.widths, own.rows.Float)
                 self._receive(blocks, rank, shared, time)
-                parts.append(local.footprints(blocks))
+                parts.append(local.table(blocks))
         return concatenate(parts)
 
     def return_columns(self, shared: SharedView, time: int, columns: list[Float]) -> list[Float]:

@@ -13,12 +13,12 @@ from drgs.core.arrays import Rows, block_widths, empty_on_host, types_of, wrap_n
 from drgs.core.types import Bool, Float, UInt32
 from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import Pipeline
-from drgs.splatting.tiles import Footprints
+from drgs.splatting.tiles import SplatTable
 
 Blocks = list[np.ndarray]
 """Rows of numbers as they travel: (M, columns) for each block of :class:`drgs.core.arrays.Rows`."""
 
-BOX_NUMBERS = 4  # numbers of a splat's box of tiles: see :class:`drgs.splatting.tiles.Footprints`
+BOX_NUMBERS = 4  # numbers of a splat's box of tiles: see :class:`drgs.splatting.tiles.SplatTable`
 
 
 def empty_blocks(count: int, widths: Sequence[int], float_type: type) -> Blocks:
@@ -38,7 +38,7 @@ class LocalSplats:
     num_keys: int
 
     @staticmethod
-    def from_splats(splats: Footprints, camera: Camera, pipeline: Pipeline) -> LocalSplats:
+    def from_splats(splats: SplatTable, camera: Camera, pipeline: Pipeline) -> LocalSplats:
         """Return what is kept of this rank's projected rows."""
         counts = splats.rows.width, splats.num_features, splats.num_keys
         return LocalSplats(camera, pipeline, splats.boxes, *counts)
@@ -59,18 +59,18 @@ class LocalSplats:
         """Columns of the blocks of a splat: its box, its stored numbers, its depth."""
         return (BOX_NUMBERS, *block_widths(self.num_stored), 1)
 
-    def footprints(self, blocks: Blocks) -> Footprints:
+    def table(self, blocks: Blocks) -> SplatTable:
         """Return received splats without copying them."""
         box, *stored, depths = (wrap_numpy(self.boxes.Float, block) for block in blocks)
         rows, boxes = Rows(tuple(stored), self.num_stored), Rows((box,), BOX_NUMBERS)
-        return Footprints(boxes, rows, depths, self.num_features, self.num_keys)
+        return SplatTable(boxes, rows, depths, self.num_features, self.num_keys)
 
     def gradients(self, columns: list[Float]) -> SplatGradients:
         """Divide columns of derivatives into those of geometry and of features."""
         num_geometry = len(columns) - self.num_features
         return SplatGradients(columns[:num_geometry], columns[num_geometry:])
 
-    def pack(self, splats: Footprints, rows: UInt32) -> Blocks:
+    def pack(self, splats: SplatTable, rows: UInt32) -> Blocks:
         """Return the projected splats of some rows of this rank, (M,), on the host."""
         count, float_type = dr.width(rows), splats.rows.Float
         if count == 0:
@@ -94,7 +94,7 @@ class LocalSplats:
         return received.load(index, index != absent)
 
 
-def concatenate(parts: Sequence[Footprints]) -> Footprints:
+def concatenate(parts: Sequence[SplatTable]) -> SplatTable:
     """Return the splats of several ranks behind one another."""
     if len(parts) == 1:
         return parts[0]
@@ -107,4 +107,4 @@ def concatenate(parts: Sequence[Footprints]) -> Footprints:
         concatenate_rows([getattr(part, name) for part in parts]) for name in ("boxes", "rows")
     )
     depths = dr.concat([part.depths for part in parts])
-    return Footprints(boxes, rows, depths, parts[0].num_features, parts[0].num_keys)
+    return SplatTable(boxes, rows, depths, parts[0].num_features, parts[0].num_keys)

@@ -35,12 +35,12 @@ from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (
     CameraGradients,
     gradients_by_row,
-    project_footprints,
+    project_splats,
     sum_of_gradients,
     sum_of_views,
     weighted_sums,
 )
-from drgs.splatting.tiles import Footprints
+from drgs.splatting.tiles import SplatTable
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.exchange import SharedView, SplatExchange
 from drgs.training.parallel.local_splats import Blocks, LocalSplats
@@ -107,13 +107,13 @@ class SeveralViews:
             self._exchange.receive_splats(each, time, own)
             for time, own in enumerate(self._project(each))
         ]
-        self.integrator.projected = ProjectedView(splats)
+        self.integrator.projected_view = ProjectedView(splats)
 
     def end_view(self, view: StepView, weights: Mapping[str, Float]) -> None:
         """End the backward pass of a view; weights: planes for weighted sums, by name."""
-        each, rendered = self._views[view.place], self.integrator.projected
+        each, rendered = self._views[view.place], self.integrator.projected_view
         assert rendered is not None, "it was rendered"
-        self.integrator.projected = None
+        self.integrator.projected_view = None
         for time, gradients in enumerate(rendered.gradients):
             columns = [*gradients.geometry, *gradients.features]
             columns = self._exchange.return_columns(each, time, columns)
@@ -165,7 +165,7 @@ class SeveralViews:
         state = read_sensor(view.view.sensor, self.integrator.near)
         return cameras_in_time(without_effects(camera_from_sensor(state), self.integrator.ignore))
 
-    def _project(self, each: _View) -> list[Footprints]:
+    def _project(self, each: _View) -> list[SplatTable]:
         """Project the rows of this rank at each time of a view."""
         each.needs_camera = read_sensor(each.view.view.sensor, self.integrator.near).is_attached
         splats = []
@@ -173,7 +173,7 @@ class SeveralViews:
             gaussians = dr.detach(self.integrator.gaussians)
             for camera in self._cameras(each.view):
                 pipeline = with_effects(self.integrator.pipeline, gaussians, camera)
-                splats.append(project_footprints(gaussians, camera, pipeline))
+                splats.append(project_splats(gaussians, camera, pipeline))
                 each.local.append(LocalSplats.from_splats(splats[-1], camera, pipeline))
         return splats
 
@@ -224,7 +224,7 @@ class SeveralViews:
             gaussians, by_time, of_cameras = dr.detach(self.integrator.gaussians), [], []
             for local, gradients in zip(each.local, each.gradients, strict=True):
                 inputs = local.camera, local.pipeline, gradients
-                of_time, of_rows = gradients_by_row(gaussians, *inputs, of_camera=True)
+                of_time, of_rows = gradients_by_row(gaussians, *inputs, with_camera=True)
                 by_time.append(of_time)
                 rows = np.stack([np.array(column) for column in of_rows], axis=1)
                 rows = self.comm.gather_rows(rows, each.renderer)

@@ -1,7 +1,7 @@
 """Meshes and other surfaces among splats; imported when a scene has surfaces.
 
-A nested integrator, such as Mitsuba's ``path``, renders them at
-the depths of the surfaces in each pixel, between the splats (``drgs.integrator.visible_surfaces``).
+A nested integrator, such as Mitsuba's ``path``, renders them at the depths of the surfaces in each
+pixel, between the splats (:mod:`drgs.integrator.light.visible_surfaces`).
 With p_k the part of the light that the k-th surface stops, T_k the transmittance of the splats in
 front of it, T that of all splats, L_k the surface's radiance, B the background, and C and A the
 sums of the colours and weights of the splats as far as surfaces let them through
@@ -30,8 +30,13 @@ import numpy as np
 from drgs.core.arrays import image_of, planes_of
 from drgs.core.errors import PluginError, UnsupportedError, format_names, one_line, root_cause
 from drgs.core.private import same_variables
-from drgs.integrator.derivatives import Parameter, attached_parameters, parameter_value, type_of
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors, pixels_adjoint
+from drgs.integrator.light.derivatives import (
+    Parameter,
+    attached_parameters,
+    parameter_value,
+    type_of,
+)
 from drgs.integrator.light.rays import (
     UNBOUNDED_DEPTH,
     RaysBehind,
@@ -40,9 +45,9 @@ from drgs.integrator.light.rays import (
     has_transparent_parts,
     sensor_behind,
 )
+from drgs.integrator.light.visible_surfaces import SurfaceLayers, transmittance_behind
 from drgs.integrator.sensors import sensors_of
 from drgs.integrator.state import SplatsState, surfaces_in
-from drgs.integrator.visible_surfaces import SurfaceLayers, transmittance_behind
 
 T = TypeVar("T")
 
@@ -259,14 +264,17 @@ class NestedSurfaces:
         cache, hide_emitters = splats.cache, splats.hide_emitters
         surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
         count = splats.nested_spp or spp
-        if splats.light != "none":
+        nested: mi.SamplingIntegrator
+        adjoint: mi.SamplingIntegrator
+        if splats.lighting.light != "none":
             from drgs.integrator.light.splat_transport import nested_with_transport
 
             num_paths = count or sensor.sampler().sample_count()
             nested = adjoint = nested_with_transport(splats, scene, num_paths, sensors_of(sensor))
         else:
-            nested = adjoint = splats.nested
-            if nested is None:
+            if splats.nested is not None:
+                nested = adjoint = splats.nested
+            else:
                 # The same paths as ``path``, with correct derivatives for more parameters, and
                 # lamps seen through transparent surfaces.
                 adjoint = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
