@@ -51,7 +51,7 @@ WARM_UP_ITERATIONS, MIN_TIMED_ITERATIONS, REHEARSAL_VIEWS = 6, 20, 8
 """Iterations of a rehearsal: those that compile kernels, and the fewest that are timed; its views.
 """
 
-REHEARSAL_SHARE = 0.03  # of the time: what a rehearsal may take
+REHEARSAL_SHARE, MAX_REHEARSAL_S = 0.03, 10.0  # of the time: what a rehearsal may take, at most
 
 NEVER = 1_000_000_000  # an iteration after all
 
@@ -67,6 +67,11 @@ class Budget:
 
     seconds: float  # as the user gave it
     end: float  # by time.perf_counter
+
+    @property
+    def rehearsal_s(self) -> float:
+        """Seconds of a rehearsal."""
+        return min(REHEARSAL_SHARE * self.seconds, MAX_REHEARSAL_S)
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.folders import config_for
 from drgs.effects.base import Examination, Examiner, TrainingEffect
-from drgs.fit.budget import REHEARSAL_SHARE, Budget, Plan, deadline, plan_fit, rehearse
+from drgs.fit.budget import Budget, Plan, deadline, plan_fit, rehearse
 from drgs.fit.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.fit.fingerprint import Fingerprint, fingerprint_of
 from drgs.fit.fit_folder import FitFolder, saved_gaussians
@@ -223,8 +223,7 @@ class FitSession:
     def _plan(self, gaussians: Gaussians, budget: Budget) -> Plan | None:
         """Plan the fit, and make the plan its configuration; None on other ranks than 0."""
         start = self.config, self.dataset, gaussians, self.comm
-        seconds = REHEARSAL_SHARE * budget.seconds
-        trainer, iteration_s = rehearse(*start, *self._objects, seconds=seconds)
+        trainer, iteration_s = rehearse(*start, *self._objects, seconds=budget.rehearsal_s)
         scene = trainer.full_scene()  # gathered from all ranks
         if scene is None:
             return None
