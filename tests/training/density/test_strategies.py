@@ -1,7 +1,7 @@
 """The trainer with any strategy, and small fits by each: they resume to the same bytes."""
 
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import import_module
 from types import SimpleNamespace
 
@@ -9,14 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support import small_fits as fits
-from support.small_capture import blobs
-from support.small_fits import everything_of, steps
 from support.trainers import make_trainer
 
 from drgs.config import extensions
 from drgs.config.schema import FitConfig
-from drgs.gaussians.parameters import Gaussians
 from drgs.training import trainer as trainer_module
 from drgs.training.density.phases import PhasedStrategy, density_strategy
 from drgs.training.density.strategy import DensityReport, DensityStrategy
@@ -172,66 +168,6 @@ def test_phases_act_as_one_strategy_and_restart_after_row_changes():
 
 
 MODULES = {"adc", "budget", "mcmc", "pruning"}
-
-MCMC = {
-    "densify__strategy": "mcmc",
-    "densify__mcmc__gaussians": 60,
-    "densify__mcmc__growth": 0.1,
-    "init__num_points": 48,
-}
-
-BUDGET = {"densify__strategy": "budget", "densify__budget__gaussians": 60}
-SELECTION = {"densify__prune__to": 20}
-
-STRATEGIES = {
-    "mcmc": MCMC,
-    "selection": SELECTION,
-    "importance": {**SELECTION, "densify__prune__method": "importance"},
-    "budget and selection": BUDGET | SELECTION,
-    "mcmc and selection": MCMC | SELECTION,
-}
-
-
-def many_blobs(count=48) -> Gaussians:
-    """Return the start of a fit whose population changes: half of the blobs are transparent."""
-    logits = np.where(np.arange(count) % 2, -6.0, 0.0).astype(np.float32)
-    return replace(blobs(count, seed=5), logit_opacities=logits)
-
-
-def trainer_of(name, **changes):
-    schedule = {
-        "densify__start": 2,
-        "densify__stop": 14,
-        "densify__every": 4,
-        "densify__prune__every": 3,
-        "densify__prune__stop": 24,
-        "iterations": 30,
-    }
-    values = schedule | STRATEGIES[name] | changes
-    return fits.make_trainer(fits.plain_dataset(), many_blobs(), **values)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pause", [5, 16])
-@pytest.mark.parametrize("name", STRATEGIES)
-def test_fit_resumes_to_the_same_bytes_from_any_iteration(name, pause):
-    whole = trainer_of(name)
-    sizes = []
-    for iteration in range(1, 28):
-        sizes.append(whole.step().num_gaussians)
-        if iteration == pause:
-            state = whole.state()
-    resumed = trainer_of(name)
-    resumed.restore(state)
-    steps(resumed, 27 - pause)
-    expected, got = everything_of(whole), everything_of(resumed)
-    assert got.keys() == expected.keys()
-    assert [key for key in expected if got[key] != expected[key]] == []
-    assert len(set(sizes)) > 2
-    if "mcmc" in name or "budget" in name:
-        assert max(sizes) <= 60
-    if name != "mcmc":
-        assert sizes[23:] == [20] * 4
 
 
 def test_unused_strategies_are_not_imported(monkeypatch):
