@@ -97,7 +97,7 @@ class Finding:
 Progress = Callable[[str, int, int], None]  # what is tried, iterations done, and of how many
 
 
-class Examination(Protocol):
+class ChosenEffects(Protocol):
     """Values of a configuration that were chosen for a dataset, with the evidence."""
 
     @property
@@ -115,7 +115,7 @@ class Examination(Protocol):
         ...
 
 
-Examiner = Callable[["Dataset", "FitConfig", Progress | None], Examination]
+Examiner = Callable[["Dataset", "FitConfig", Progress | None], ChosenEffects]
 """Chooses effects for a dataset and a configuration, whose own values stay."""
 
 

@@ -225,7 +225,6 @@ SELECTION = {"densify__prune__to": 20}
 STRATEGIES = {
     "mcmc": MCMC,
     "selection": SELECTION,
-    "importance": {**SELECTION, "densify__prune__method": "importance"},
     "budget and selection": BUDGET | SELECTION,
     "mcmc and selection": MCMC | SELECTION,
 }
