@@ -257,7 +257,8 @@ from drgs.__main__ import main
 try:
     main(['--help'])
 except SystemExit:
-    print(sorted({'mitsuba', 'drjit', 'matplotlib', 'drgs.fit.__main__', 'drgs.bench.__main__'} & set(sys.modules)))
+    heavy = {'mitsuba', 'drjit', 'matplotlib', 'drgs.fit.__main__', 'drgs.bench.__main__'}
+    print(sorted(heavy & set(sys.modules)))
 """
     assert run_python(program).stdout.splitlines()[-1] == "[]"
 
