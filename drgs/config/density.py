@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -20,17 +20,16 @@ REFERENCE_START, REFERENCE_STOP = 500, 15_000  # iterations: the reference's sch
 
 
 class PruneConfig(Section):
-    """Pruning to a given number of Gaussians, after any strategy."""
+    """Pruning to a given number of Gaussians, after any strategy.
 
+    Opacities are lowered against the loss until enough Gaussians are transparent.
+    """
+
+    removed: ClassVar = {"method": "selection", "opacity": 0.005, "opacity_rate": 4.0}
     scaled: ClassVar = ("start", "stop")
 
     to: Count | None = Field(
         None, ge=1, description="Maximum number of Gaussians at the end; null: no pruning."
-    )
-    method: Literal["selection", "importance"] = Field(
-        "selection",
-        description="selection: opacities are lowered against the loss until enough Gaussians are "
-        "transparent. importance: Gaussians that contribute least to images are removed.",
     )
     start: Count | None = Field(
         None,
@@ -43,15 +42,6 @@ class PruneConfig(Section):
         description="Iteration of the last change. null: half of the remaining ones.",
     )
     every: Count = Field(50, ge=1, description="Iterations between two changes.")
-    opacity: float = Field(
-        0.005, gt=0, lt=1, description="selection: remove less opaque Gaussians."
-    )
-    opacity_rate: float = Field(
-        4.0,
-        gt=0,
-        le=100,
-        description="selection: factor of optimizer.opacities_lr during this phase.",
-    )
 
 
 class DensifyConfig(ExtensibleSection):

@@ -159,6 +159,8 @@ class DataConfig(Section):
 class InitConfig(Section):
     """The Gaussians at iteration 0."""
 
+    removed: ClassVar = {"scale": 1.0}
+
     start: Literal["auto", "masks", "points", "random"] = Field(
         "auto",
         description="Start of the Gaussians. masks: the surface of the visual hull of the images' "
@@ -182,13 +184,6 @@ class InitConfig(Section):
         "cameras of NeRF-synthetic scenes, else a box derived from the cameras.",
     )
     opacity: float = Field(0.1, ge=1e-6, le=0.999999, description="Initial opacity.")
-    scale: float = Field(
-        1.0,
-        ge=1e-3,
-        le=1e3,
-        description="Initial standard deviation, relative to the RMS distance to the three nearest "
-        "neighbours.",
-    )
     point_cloud: PathField | None = Field(
         None,
         description="PLY with x, y, z (and red, green, blue), or a points3D file of COLMAP. null: "
@@ -292,6 +287,8 @@ class ModelConfig(_ModelWithApproximations):
 class OptimizerConfig(Section):
     """Adam (Kingma and Ba 2015): learning rates per step and its constants."""
 
+    removed: ClassVar = {"epsilon": 1e-15}
+
     means_lr: Rate = Field(3.2e-4, gt=0, description="Initial rate of the means, in scene extents.")
     means_lr_final: Rate = Field(
         3.2e-6, gt=0, description="Final rate of the means; the decay is exponential."
@@ -343,25 +340,17 @@ class OptimizerConfig(Section):
     )
     beta_1: Decay = Field(0.9, description="Decay of the first moment.")
     beta_2: Decay = Field(0.999, description="Decay of the second moment.")
-    epsilon: float = Field(
-        1e-15,
-        ge=1e-30,
-        le=1,
-        description="Added to the root of the second moment.",
-    )
 
 
 class LossConfig(Section):
     """(1 - w) L1 + w (1 - SSIM), in display space."""
 
+    removed: ClassVar = {"window": 11, "sigma": 1.5}
+
     type: Annotated[str, name_of(LOSSES)] = Field(
         "photometric", description="photometric, or the name of an extension."
     )
     dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 disables D-SSIM.")
-    window: int = Field(11, ge=3, le=17, description="px: width of SSIM's Gaussian window; odd.")
-    sigma: float = Field(
-        1.5, ge=0.1, le=1000, description="px: standard deviation of SSIM's window."
-    )
     depth_weight: Weight = Field(
         0.2,
         description="Weight of the mean absolute error of depth, in scene extents, if the data has "
@@ -558,7 +547,6 @@ class FitConfig(ExtensibleSection):
             got = f"{_format_section(before)} before {_format_section(after)}"
             expected = "coarse must be stages with growing until and falling factor"
             _require(is_in_order, expected, got)
-        _require(self.loss.window % 2 == 1, "loss.window must be odd", self.loss.window)
         return self
 
     def require_room(self, key: str, cap: int | None) -> None:

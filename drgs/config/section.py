@@ -51,6 +51,20 @@ class Section(BaseModel):
     scaled: ClassVar[tuple[str, ...]] = ()
     """Names of iterations that keep their share where the number of iterations changes."""
 
+    removed: ClassVar[Mapping[str, object]] = {}
+    """Values of earlier versions that are constants now."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_removed(cls, values: object) -> object:
+        if not isinstance(values, Mapping) or not cls.removed.keys() & values.keys():
+            return values
+        for name, constant in cls.removed.items():
+            if values.get(name, constant) != constant:
+                expected = f"{format_value(constant)}, its only value since 0.1.0 (CHANGELOG.md)"
+                raise _section_error(name, expected, values[name])
+        return {name: value for name, value in values.items() if name not in cls.removed}
+
     @property
     def is_off(self) -> bool:
         """True if a fit with this section is a fit without it."""

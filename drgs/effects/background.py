@@ -42,13 +42,8 @@ class RandomBackground(TrainingEffect):
 
     @classmethod
     @override
-    def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
-        return config.data.random_background
-
-    @classmethod
-    @override
     def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
-        if not cls.is_used(config, dataset):
+        if not config.data.random_background:
             return []
         what = "a random colour at each iteration"
         return [SimulatedEffect("background", what, "data.random_background")]

@@ -97,7 +97,7 @@ class Finding:
 Progress = Callable[[str, int, int], None]  # what is tried, iterations done, and of how many
 
 
-class Examination(Protocol):
+class ChosenEffects(Protocol):
     """Values of a configuration that were chosen for a dataset, with the evidence."""
 
     @property
@@ -115,7 +115,7 @@ class Examination(Protocol):
         ...
 
 
-Examiner = Callable[["Dataset", "FitConfig", Progress | None], Examination]
+Examiner = Callable[["Dataset", "FitConfig", Progress | None], ChosenEffects]
 """Chooses effects for a dataset and a configuration, whose own values stay."""
 
 
@@ -132,13 +132,16 @@ class TrainingEffect(Protocol):
 
     @classmethod
     def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
-        """Return whether the effect takes part in a fit: by default, if it has a section."""
-        return cls.name in config.sections
+        """Return whether the effect takes part in a fit: by default, if the summary has it."""
+        return any(line.what is not None for line in cls.summarize(config, dataset))
 
     @classmethod
     def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
-        """Return the effect's lines in the summary of a fit; one of a known name replaces it."""
-        if not cls.is_used(config, dataset):
+        """Return the effect's lines in the summary of a fit, with what enables it.
+
+        By default, its section does. A line of a name that the summary has replaces that line.
+        """
+        if cls.name not in config.sections:
             return []
         extension = EFFECTS.get(cls.name)
         return [SimulatedEffect(cls.name, f"{extension.kind}: {extension.summary}", cls.name)]

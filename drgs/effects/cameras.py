@@ -124,11 +124,6 @@ class CameraRefinement(OptimisedEffect):
 
     @classmethod
     @override
-    def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
-        return config.section("cameras", CamerasConfig).optimise
-
-    @classmethod
-    @override
     def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
         rates = config.section("cameras", CamerasConfig)
         what = join_parts(

@@ -86,14 +86,9 @@ class ColorCorrection(CenteredEffect):
 
     @classmethod
     @override
-    def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
-        return config.section("colors", ColorConfig).lr is not None
-
-    @classmethod
-    @override
     def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
-        what = "a colour transform for each training photograph"
-        what = what if cls.is_used(config, dataset) else None
+        is_used = config.section("colors", ColorConfig).lr is not None
+        what = "a colour transform for each training photograph" if is_used else None
         return [SimulatedEffect("exposure and white balance", what, "colors.lr")]
 
     @classmethod

@@ -39,12 +39,6 @@ class DepthSupervision(TrainingEffect):
 
     @classmethod
     @override
-    def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
-        has_depth = any(view.depth is not None for view in dataset.train)
-        return config.loss.depth_weight > 0 and has_depth
-
-    @classmethod
-    @override
     def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
         depths = [view.depth for view in dataset.train]
         effect = SimulatedEffect.from_data("depth", depths, "supervision")

@@ -30,11 +30,6 @@ class Masks(TrainingEffect):
 
     @classmethod
     @override
-    def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
-        return any(view.mask is not None for view in dataset.train)
-
-    @classmethod
-    @override
     def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
         masks = [view.mask for view in dataset.train]
         effect = SimulatedEffect.from_data("masks", masks, "pixels left out")

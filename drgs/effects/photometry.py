@@ -53,11 +53,6 @@ class Photometry(CenteredEffect):
 
     @classmethod
     @override
-    def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
-        return bool(given_rates(config.section("colors", ColorConfig)))
-
-    @classmethod
-    @override
     def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
         names = given_rates(config.section("colors", ColorConfig))
         return [SimulatedEffect(n, "of each camera", f"colors.{n}_lr") for n in names]

@@ -22,7 +22,7 @@ from drgs.core.errors import UserError
 from drgs.core.files import atomic_path
 from drgs.core.folders import sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
-from drgs.effects.base import Examination
+from drgs.effects.base import ChosenEffects
 from drgs.fit.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.fit.inputs import versions
 from drgs.fit.loop import History
@@ -91,7 +91,7 @@ class FitFolder:
         with atomic_path(self.path / files.BUDGET_PLAN) as temporary:
             temporary.write_text(text)
 
-    def write_examination(self, examination: Examination) -> None:
+    def write_examination(self, examination: ChosenEffects) -> None:
         """Write what was chosen, and why."""
         with atomic_path(self.path / files.EXAMINATION) as temporary:
             temporary.write_text(examination.to_json())

@@ -30,7 +30,7 @@ from drgs.core.memory import release_unused_memory
 from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.folders import config_for
-from drgs.effects.base import Examination, Examiner, TrainingEffect
+from drgs.effects.base import ChosenEffects, Examiner, TrainingEffect
 from drgs.fit.budget import Budget, Plan, deadline, plan_fit, rehearse
 from drgs.fit.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.fit.fingerprint import Fingerprint, fingerprint_of
@@ -103,7 +103,7 @@ class FitSession:
     effects: Sequence[TrainingEffect] = ()  # besides the configured ones
     loss: Loss | None = None  # None: the configured one
     examines: bool = False  # whether an examination of the dataset chooses effects
-    examination: Examination | None = field(init=False, default=None)
+    examination: ChosenEffects | None = field(init=False, default=None)
     trainer: Trainer = field(init=False)
     history: History = field(init=False)
     continues: Continues = field(init=False, default_factory=lambda: until_planned_end)

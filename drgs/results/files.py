@@ -26,7 +26,7 @@ METRICS = "metrics.json"  # written last
 ERROR_BUDGET = "error_budget.json"  # of ``drgs render --error``
 
 
-def results() -> list[str]:
+def result_names() -> list[str]:
     """Return the files of a fit but for ``config.yml``, with those of effects."""
     names = [name for effect in EFFECTS.all() for name in effect.value.files]
     names += [CHECKPOINT, CURVES, DENSITY, EXAMINATION, HISTORY, METRICS, ORBIT, ORBIT_GIF]

@@ -29,7 +29,7 @@ from drgs.results.files import (
     RENDERS,
     SIDE_BY_SIDE,
     TENSORBOARD,
-    results,
+    result_names,
 )
 
 COMMAND = "fit"
@@ -205,7 +205,9 @@ def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
     record, files = FolderRecord(folder, COMMAND), list(_files(folder))
     if names:
         load_run_config(folder)
-        _check_removable(folder, record, sorted(set(names) - {CONFIG, *results()}), files, images)
+        _check_removable(
+            folder, record, sorted(set(names) - {CONFIG, *result_names()}), files, images
+        )
     elif not os.path.lexists(folder):
         return
     remove_stale_temporaries(folder)
@@ -247,7 +249,7 @@ def _check_removable(
 
 def _files(folder: Path) -> Iterator[str]:
     """Yield the names of the results that are there, and of everything in FOLDERS."""
-    for name in results():
+    for name in result_names():
         path = folder / name
         if name not in FOLDERS or path.is_symlink() or not path.is_dir():
             if os.path.lexists(path):
@@ -261,7 +263,7 @@ def _files(folder: Path) -> Iterator[str]:
 
 def _file_names(images: Sequence[str]) -> list[str]:
     """Return the files that a fit writes, except ``config.yml``, whose content is checked."""
-    return [*(name for name in results() if name not in FOLDERS), EVENTS, *images]
+    return [*(name for name in result_names() if name not in FOLDERS), EVENTS, *images]
 
 
 def _visible_names(folder: Path) -> list[str]:

@@ -84,13 +84,12 @@ def make_phases(
     room = 0 if any(map(is_on_disk, views)) else min(room, MAX_TARGET_BYTES)
     sizes = [(s.until, [smaller_view(v, s.factor) for v in views]) for s in config.coarse]
     is_refined = any(effect.moves_sensors for effect in effects)
-    window = config.loss.window, config.loss.sigma
     phases = []
     for until, resized in [*sizes, (math.inf, views)]:
         shifted = [(view,) if is_refined else shift_pixels(view) for view in resized]
         sensors = iter(make_sensors(list(chain(*shifted)), calibrated=is_refined))
         training_views = [
-            [TrainingView(view, index, next(sensors), effects, window) for view in views_of_one]
+            [TrainingView(view, index, next(sensors), effects) for view in views_of_one]
             for index, views_of_one in enumerate(shifted)
         ]
         phases.append(ResolutionPhase(until, training_views, bytes_per_pixel(effects), room))

@@ -135,7 +135,6 @@ class Trainer:
             self.rates(0),
             beta_1=config.optimizer.beta_1**views_per_step,
             beta_2=config.optimizer.beta_2**views_per_step,
-            epsilon=config.optimizer.epsilon,
         )
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)

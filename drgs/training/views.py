@@ -34,14 +34,13 @@ class TrainingView:
         index: int,
         sensor: mi.Sensor,
         effects: Sequence[TrainingEffect],
-        window: tuple[int, float],
     ) -> None:
-        """index: among the training views; window: width and sigma of SSIM's window, px."""
+        """index: among the training views"""
         self.name, self.width, self.height = view.name, view.width, view.height
         self.index, self.sensor = index, sensor
         self.uploads = Uploads(self, effects)
         self.replacement: Target | None = None  # an effect's
-        self._view, self._effects, self._window = view, effects, window
+        self._view, self._effects = view, effects
         self._ahead: Future[View] | None = None
 
     def read_ahead(self, thread: Executor) -> None:
@@ -67,11 +66,11 @@ class TrainingView:
         image = np.asarray(view.image)
         for effect in self._effects:
             image = effect.target_image(view, image)
-        return prepare_target(as_tensor(image), *self._window)
+        return prepare_target(as_tensor(image))
 
     def replace_photograph(self, image: TensorXf) -> None:
         """Compare the coming rendering with another image, (H, W, 3)."""
-        self.replacement = prepare_target(image, *self._window)
+        self.replacement = prepare_target(image)
 
     @property
     def target(self) -> Target:

@@ -47,7 +47,7 @@ def test_lego_paper_is_the_reference_recipe():
     optimizer, densify, adc = config.optimizer, config.densify, config.densify.adc
     assert (optimizer.means_lr, optimizer.means_lr_final) == (1.6e-4, 1.6e-6)
     assert (optimizer.sh0_lr, optimizer.shN_lr, optimizer.opacities_lr) == (2.5e-3, 1.25e-4, 0.05)
-    assert (optimizer.scales_lr, optimizer.quats_lr, optimizer.epsilon) == (5e-3, 1e-3, 1e-15)
+    assert (optimizer.scales_lr, optimizer.quats_lr) == (5e-3, 1e-3)
     assert optimizer.decay == 1  # of all but the means, constant rates
     assert (densify.start, densify.stop, densify.every) == (500, 15_000, 100)
     assert (densify.strategy, densify.prune.to) == ("adc", None)
@@ -133,9 +133,12 @@ WRONG_VALUES = [
         'output: {dir: "\\0"}',
         "output.dir must be a path in UTF-8 without zero bytes, got '\\x00'",
     ),
-    ("loss: {sigma: big}", "loss.sigma must be a number, got 'big'"),
-    ("loss: {sigma: .inf}", "loss.sigma must be a finite number, got .inf"),
-    ("loss: {window: 4}", "loss.window must be odd, got 4"),
+    ("loss: {dssim_weight: big}", "loss.dssim_weight must be a number, got 'big'"),
+    ("loss: {dssim_weight: .inf}", "loss.dssim_weight must be a finite number, got .inf"),
+    (
+        "loss: {window: 7, sigma: 1.5}",
+        "loss.window must be 11, its only value since 0.1.0 (CHANGELOG.md), got 7",
+    ),
     ("init: {opacity: 1}", "init.opacity must be <= 0.999999, got 1"),
     ("model: {antialiased: some}", "model.antialiased must be true or false, got 'some'"),
     ("model:", "model must be a section of keys, got null"),
@@ -258,11 +261,12 @@ def test_overrides_win_over_the_file_and_the_last_one_wins(load):
         "densify.strategy=adc",
         "seed=2",
         "seed=3",
-        "loss.sigma=2e0",
+        "loss.dssim_weight=1e0",
         "data.background=[0, 0.5, 1]",
     )
-    config = load(MINIMAL + "seed: 1\noptimizer: {epsilon: 1e-8}", *given, "data.path=a: [b")
-    assert (config.seed, config.loss.sigma, config.optimizer.epsilon) == (3, 2.0, 1e-8)
+    config = load(MINIMAL + "seed: 1\noptimizer: {means_lr_final: 1e-8}", *given, "data.path=a: [b")
+    assert (config.seed, config.loss.dssim_weight) == (3, 1.0)
+    assert config.optimizer.means_lr_final == 1e-8
     assert config.data.background == config.data.background_rgb == (0.0, 0.5, 1.0)
     assert config.data.path.name == "a: [b" and config.optimizer.decay == 0.5
     assert load(MINIMAL, "data.path=2024").data.path.name == "2024"

@@ -178,12 +178,12 @@ def saved_as(folder, config, change):
 
 
 def remove_new_keys(values):
-    del values["data"]["ignore_points"], values["init"]["start"], values["init"]["scale"]
+    del values["data"]["ignore_points"], values["init"]["start"]
     for name in ("decay", "decay_from", "views", "views_from"):
         del values["optimizer"][name]
     densify = values["densify"]
     kept = ("strategy", "start", "stop", "every", "max_gaussians", "adc")
-    values["densify"] = {name: densify[name] for name in kept}
+    values["densify"] = {name: densify[name] for name in kept if name in densify}
 
 
 def test_checkpoint_of_an_earlier_version_is_continued(tmp_path, config):

@@ -69,7 +69,6 @@ SLOW_FITS = {
     "after a change, smoothing": (plain, {**ADC, **SMOOTHING}, 5, 6),
     "growth, then selection": (plain, {**PRUNING, **MCMC}, 5, 22),
     "selection": (plain, PRUNING, 16, 11),
-    "importance": (plain, {**PRUNING, "densify__prune__method": "importance"}, 16, 11),
     **{f"late step, {before}": (plain, LATE_STEPS, before, 5) for before in (4, 5, 6, 7)},
     "cameras, coarse": (plain, {**CAMERAS, **COARSE}, 4, 5),
     # The filter depends on where all cameras are, also on those not seen since.

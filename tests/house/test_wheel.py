@@ -126,7 +126,7 @@ def test_the_console_script_and_the_module_are_the_same_program(scripts, tmp_pat
 
 
 def test_a_wheel_without_some_commands_has_the_others(wheel, tmp_path):
-    """What is shipped has no other way in than its entry points."""
+    """Entry points of missing packages are left out."""
     scripts, packages = install(wheel, tmp_path)
     for command in ("export", "poses", "capture", "bench", "examine"):
         shutil.rmtree(packages / "drgs" / command)

@@ -44,6 +44,10 @@ def test_configurations_and_images_of_scenes_stay_the_same():
     values = yaml.safe_load((EARLIER_VERSION / "config.yml").read_text())
     loaded = load_config(EARLIER_VERSION / "config.yml").model_dump(mode="json")
     assert values.pop("extensions") == {}
+    removed = {"init": ["scale"], "loss": ["window", "sigma"], "optimizer": ["epsilon"]}
+    removed = {**removed, "prune": ["method", "opacity", "opacity_rate"]}
+    sections = {**values, "prune": values["densify"]["prune"]}
+    assert all(sections[section].pop(name) for section in removed for name in removed[section])
     newer = [loaded["data"].pop(key) for key in ("leave_out", "in_memory", "depth_from")]
     assert [*newer, loaded["densify"].pop("remove_floaters")] == [[], None, None, True]
     newer = [loaded["colors"].pop(f"{name}_lr") for name in ("vignetting", "response")]

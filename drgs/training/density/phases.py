@@ -16,7 +16,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.types import Float
 from drgs.datasets.types import Dataset
 from drgs.training.density.floaters import Floaters
-from drgs.training.density.pruning import METHODS
+from drgs.training.density.pruning import NaturalSelection
 from drgs.training.density.strategy import (
     DensityReport,
     DensityStrategy,
@@ -43,7 +43,7 @@ def density_strategy(
     if densify.remove_floaters:
         phases.append(Floaters.from_config(config, dataset, None))
     if densify.prune.to is not None:
-        phases.append(METHODS[densify.prune.method].from_config(config, dataset, None))
+        phases.append(NaturalSelection(config))
     return growth if len(phases) == 1 else PhasedStrategy(phases)
 
 
