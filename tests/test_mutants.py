@@ -128,7 +128,7 @@ class Copies:
             given = {
                 name: value
                 for name, value in vars(tiles.bins.model).items()
-                if type(value).__module__ != footprint.__name__
+                if type(value).__module__ != footprint.__name__ or name == "cutoffs"
             }
             bins = replace(tiles.bins, model=self.model["ImageModel"](**given))
             return self.kernels[name](replace(tiles, bins=bins), *arguments)
@@ -303,6 +303,10 @@ ELSEWHERE = {
             "self(image, target)",
         )
     },
+    "footprint._productsreturn [a * b for a, b in zip(values, flat_columns(grid), strict=True)]": (
+        "test_sampling: points anywhere in pixels"
+    ),
+    "footprint.Cutoffs.log2_floorat_extent > least": "the package's own cut-offs are used",
     **dict.fromkeys(
         (
             "rendering.Pipeline.select_differentiable"

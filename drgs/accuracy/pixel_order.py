@@ -114,7 +114,7 @@ class PixelOrder(CenterOrder):
         return _adjoint(inputs, tiles, d_planes, before)
 
     @override
-    def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> CompositedTiles:
+    def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
         return _tangent(_WalkInputs.from_tiles(tiles, self), tiles, tangents)
 
 
@@ -476,9 +476,7 @@ def _add_product(high: Float, low: Float, a: Float, b: Float) -> tuple[Float, Fl
 # ----------------------------------------------------------------------------------------------
 
 
-def _tangent(
-    inputs: _WalkInputs, tiles: CompositedTiles, tangents: SplatGradients
-) -> CompositedTiles:
+def _tangent(inputs: _WalkInputs, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
     bins, model, size = inputs.bins, inputs.model, inputs.size
     d_records, count = pack_tangents(bins, tangents), tiles.count
 
@@ -515,4 +513,4 @@ def _tangent(
     )
     columns = dT + flat_columns(dC)
     dr.eval(columns)
-    return replace(tiles, values=scatter_rows(columns, inputs.lanes.micro_tile, size))
+    return tiles.unpack(scatter_rows(columns, inputs.lanes.micro_tile, size))

@@ -397,7 +397,7 @@ class SensorRender:
     def frames(self) -> list[list[rendering.Frame]]:
         """Frames by time and by pass, from the cache where nothing has changed."""
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
-        state = self._detached
+        state = self._camera_state
         traced = None if self.nested is None else self._traced_surfaces(self.nested)
         key = (pipeline, self.key, *state.settings, traced), (gaussians, state.device)
 
@@ -444,7 +444,7 @@ class SensorRender:
     def _traced_surfaces(self, nested: NestedSurfaces) -> Cached[list[list[SurfaceLayers]]]:
         from drgs.integrator.light.visible_surfaces import trace_surfaces
 
-        state = self._detached
+        state = self._camera_state
         hides, (_, far) = self.splats.hide_emitters, depth_range(self.sensor)
         settings = nested.surfaces, self.key, hides, far, *state.settings
         return self.splats.cache.find(
@@ -473,7 +473,7 @@ class SensorRender:
         return read_sensor(self.sensor, self.splats.near)
 
     @cached_property
-    def _detached(self) -> SensorState:
+    def _camera_state(self) -> SensorState:
         return self._state().detach()
 
     def _cameras(self, state: SensorState) -> list[Camera]:

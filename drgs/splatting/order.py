@@ -81,7 +81,7 @@ class CenterOrder:
         """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
         return composite_adjoint(tiles, d_planes, samples, before)
 
-    def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> CompositedTiles:
+    def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
         """See :func:`drgs.splatting.rasterize.composite_tangent`."""
         return composite_tangent(tiles, tangents)
 
@@ -104,10 +104,7 @@ class CompositedGroups(CompositedTiles):
 
     @override
     def planes(self) -> list[Float]:
-        planes: dict[int, Float] = {}
-        for group, part in zip(_groups(self.bins), self.parts, strict=True):
-            planes |= zip(group.places, part.planes(), strict=True)
-        return [planes[place] for place in range(1 + self.count)]
+        return _join_planes(self, [part.planes() for part in self.parts])
 
 
 @dataclass(frozen=True)
@@ -177,20 +174,25 @@ class InGroups(CenterOrder):
         return SplatGradients(geometry, features)
 
     @override
-    def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> CompositedGroups:
-        parts = tuple(
-            self.order.tangent(
-                part, replace(tangents, features=[tangents.features[k] for k in group.stored])
-            )
-            for group, part in _parts(tiles)
-        )
-        assert isinstance(tiles, CompositedGroups), "made by self.composite"
-        return replace(tiles, parts=parts)
+    def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
+        planes = []
+        for group, part in _parts(tiles):
+            direction = replace(tangents, features=[tangents.features[k] for k in group.stored])
+            planes.append(self.order.tangent(part, direction))
+        return _join_planes(tiles, planes)
 
 
 def _groups(bins: TileBins) -> tuple[FeatureGroup, ...]:
     size = FEATURES_AT_ONCE[dr.itemsize_v(bins.rows.Float)]
     return tuple(bins.model.features.groups(bins.num_features, size))
+
+
+def _join_planes(tiles: CompositedTiles, parts: Sequence[list[Float]]) -> list[Float]:
+    """Return the planes of all groups, from those of each."""
+    planes: dict[int, Float] = {}
+    for group, part in zip(_groups(tiles.bins), parts, strict=True):
+        planes |= zip(group.places, part, strict=True)
+    return [planes[place] for place in range(1 + tiles.count)]
 
 
 def _select_group(group: FeatureGroup, bins: TileBins) -> TileBins:

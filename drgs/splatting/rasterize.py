@@ -47,7 +47,7 @@ and writes them into the slot of this (splat, micro-tile) pair: see
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from operator import and_
 from typing import Any, cast
@@ -98,7 +98,11 @@ class CompositedTiles:
         The first is T, the transmittance of the background; then sum_i w_i c_i for each component
         of c.
         """
-        t = types_of(type(self.values))
+        return self.unpack(self.values)
+
+    def unpack(self, values: Float) -> list[Float]:
+        """Return planes, from numbers that are stored as ``values`` are."""
+        t = types_of(type(values))
         pixel, grid = dr.arange(t.UInt32, self.bins.grid.num_pixels), self.bins.grid
         y = quotient(pixel, grid.width)
         x = pixel - y * dr.opaque(t.UInt32, grid.width)
@@ -108,7 +112,7 @@ class CompositedTiles:
         micro = ((y % TILE) // MICRO) * GRID + (x % TILE) // MICRO
         base = (tile * MICROS + micro) * (PIXELS * (1 + self.count))
         index = base + (y % MICRO) * MICRO + x % MICRO
-        return [dr.gather(t.Float, self.values, index + PIXELS * k) for k in range(1 + self.count)]
+        return [dr.gather(t.Float, values, index + PIXELS * k) for k in range(1 + self.count)]
 
 
 def composite_step(transmittance: Float, alpha: Float, stop: float) -> tuple[Float, Float, Bool]:
@@ -222,11 +226,16 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
     columns[:PIXELS] = [dr.abs(T) for T in columns[:PIXELS]]
     ends = [ends[pixel] for pixel in range(PIXELS)]
     dr.eval(columns, ends)
-    values, by_pixel, by_lane = (
-        scatter_rows(each, lanes.micro_tile, size) for each in (columns, ends, [largest(ends)])
+    stored = CompositedTiles(
+        bins=bins,
+        records=records,
+        values=scatter_rows(columns, lanes.micro_tile, size),
+        ends=scatter_rows(ends, lanes.micro_tile, size),
+        stop=scatter_rows([largest(ends)], lanes.micro_tile, size),
+        count=count,
     )
-    dr.eval(values, by_pixel, by_lane)
-    return CompositedTiles(bins, records, values, by_pixel, by_lane, count)
+    dr.eval(stored.values, stored.ends, stored.stop)
+    return stored
 
 
 def sign_bits(value: Float) -> Int32:
@@ -442,11 +451,11 @@ def splat_gradients(
 # ----------------------------------------------------------------------------------------------
 
 
-def composite_tangent(tiles: CompositedTiles, tangents: SplatGradients) -> CompositedTiles:
+def composite_tangent(tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
     """Return directional derivatives of the planes along ``tangents`` of the 2D splats.
 
-    tangents: the direction, in the fields of the gradients. Returns the tangents of the planes of
-    :func:`composite`. Not differentiated: the order, the decisions.
+    tangents: the direction, in the fields of the gradients. Not differentiated: the order, the
+    decisions.
     """
     bins, count = tiles.bins, tiles.count
     t = types_of(bins.rows.Float)
@@ -490,7 +499,7 @@ def composite_tangent(tiles: CompositedTiles, tangents: SplatGradients) -> Compo
     )
     columns = dT + [v for plane in dC for v in plane]
     dr.eval(columns)
-    return replace(tiles, values=scatter_rows(columns, lanes.micro_tile, size))
+    return tiles.unpack(scatter_rows(columns, lanes.micro_tile, size))
 
 
 def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:

@@ -401,7 +401,7 @@ def frames_tangent(
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
     direction = _splat_tangents(gaussians, frames[0], tangents, camera_tangents)
-    return [frame.order.tangent(frame.tiles, direction).planes() for frame in frames]
+    return [frame.order.tangent(frame.tiles, direction) for frame in frames]
 
 
 def _splat_tangents(
@@ -472,7 +472,9 @@ def _as_tensors(
         flat = first_numbers(stored[name], dr.width(like))
         return t.TensorXf(flat, like.shape) if dr.is_tensor_v(like) else flat
 
-    likes = {n: v for n, v in gaussians.arrays.items() if n in stored or n != "smoothing"}
+    likes = gaussians.arrays
+    if "smoothing" not in stored:  # it is not differentiated
+        likes.pop("smoothing", None)
     return Gaussians.from_arrays({name: gradient(name, like) for name, like in likes.items()})
 
 
