@@ -34,14 +34,15 @@ READERS: Registry[type] = Registry("dataset reader", "drgs.readers")
 EXAMINERS: Registry = Registry("examiner", "drgs.examiners")
 """Functions that choose effects by evidence: see :class:`drgs.effects.base.Examiner`."""
 
-Sections = Mapping[str, "BaseModel | None"]
-"""Sections of extensions by name, each as the extension's model; None: it has no settings."""
+Sections = Mapping[str, "BaseModel"]
+"""Sections of extensions by name, each as the extension's model."""
 
 
 def section_of(extension: Extension, sections: Sections) -> BaseModel | None:
     """Return the section of an extension, with defaults if it is not set; None: it has no model."""
-    section = sections.get(extension.name)
-    return extension.section() if section is None and extension.section else section
+    if extension.section is None:
+        return None
+    return sections.get(extension.name) or extension.section()
 
 
 def describe_extensions() -> str:

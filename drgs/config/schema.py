@@ -537,8 +537,7 @@ class FitConfig(ExtensibleSection):
         expected = f"optimizer.means_lr_final must be <= optimizer.means_lr ({optimizer.means_lr})"
         _require(last <= optimizer.means_lr, expected, last)
         for section in (*densify.sections.values(), *self.sections.values()):
-            if section is not None:
-                section.check(self)
+            section.check(self)
         if densify.prune.to is not None:
             self._check_last_phase()
         self.require_room("densify.max_gaussians", densify.max_gaussians)

@@ -14,6 +14,7 @@ from pydantic import (
     Field,
     ModelWrapValidatorHandler,
     ValidationError,
+    create_model,
     model_validator,
 )
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
@@ -61,8 +62,9 @@ class Section(BaseModel):
             return values
         for name, constant in cls.removed.items():
             if values.get(name, constant) != constant:
-                expected = f"{format_value(constant)}, its only value since 0.1.0 (CHANGELOG.md)"
-                raise _section_error(name, expected, values[name])
+                text = f"{format_value(constant)}, its only value since 0.1.0 (CHANGELOG.md)"
+                error = ErrorDetails(type=text, loc=(name,), msg=text, input=values[name])
+                raise ValidationError.from_exception_data(name, [_error_details(error)])
         return {name: value for name, value in values.items() if name not in cls.removed}
 
     @property
@@ -85,8 +87,8 @@ class ExtensibleSection(Section):
     registries: ClassVar[tuple[Registry, ...]] = ()  # of these extensions
 
     @property
-    def sections(self) -> Mapping[str, Section | None]:
-        """The sections of extensions by name; None: the extension has no settings."""
+    def sections(self) -> Mapping[str, Section]:
+        """The sections of extensions by name."""
         return self.model_extra or {}
 
     def section(self, name: str, model: type[SectionType]) -> SectionType:
@@ -119,56 +121,29 @@ class ExtensibleSection(Section):
         if not isinstance(values, Mapping):
             return handler(values)
         values = cls.relocate(values)
-        own = {k: v for k, v in values.items() if k in cls.model_fields}
-        sections: dict[str, Section | None] = {}
-        errors: list[ErrorDetails] = []
-        for name in (name for name in values if name not in own):
+        own = {key: value for key, value in values.items() if key in cls.model_fields}
+        others = {str(key): _to_mapping(values[key]) for key in values if key not in own}
+        extensions = [extension for name in others if (extension := cls.extension(name))]
+        models: dict[str, Any] = {each.name: (each.section or Section, ...) for each in extensions}
+        sections = create_model("Sections", __base__=Section, **models)
+        valid, errors = [], []
+        for validate, given in ((handler, own), (sections.model_validate, others)):
             try:
-                sections[name] = _validate_section(cls.extension(str(name)), name, values[name])
+                valid.append(validate(given))
             except ValidationError as error:
-                errors += error.errors()
-        result = None
-        try:
-            result = handler(own)
-        except ValidationError as error:
-            errors = [*error.errors(), *errors]
-        if result is None or errors:
-            details = [_error_details(error) for error in errors]
-            raise ValidationError.from_exception_data(cls.__name__, details)
-        ordered = {name: sections[name] for name in values if name in sections}
+                errors += map(_error_details, error.errors())
+        if errors:
+            raise ValidationError.from_exception_data(cls.__name__, errors)
+        result = cast(Self, valid[0])
         assert result.__pydantic_extra__ is not None, "extra is allowed"
-        result.__pydantic_extra__.update(ordered)
-        result.__pydantic_fields_set__.update(ordered)
+        result.__pydantic_extra__.update({name: getattr(valid[1], name) for name in others})
+        result.__pydantic_fields_set__.update(others)
         return result
 
 
-def _validate_section(extension: Extension | None, name: str, values: object) -> Section | None:
-    """Return the section ``name`` of an extension, as its model.
-
-    Raises pydantic's ``ValidationError`` with the place of each wrong value.
-    """
-    if extension is None:
-        raise _section_error(name, "extra_forbidden", values)
-    model = extension.section
-    if model is None:
-        if values:
-            raise _section_error(name, "empty, as the extension has no settings", values)
-        return None
-    if not issubclass(model, Section):
-        base = f"{Section.__module__}.{Section.__name__}"
-        raise _section_error(name, f"of an extension whose model is a subclass of {base}", values)
-    if isinstance(values, BaseModel):
-        values = values.model_dump()
-    try:
-        return model.model_validate({} if values is None else values)
-    except ValidationError as error:
-        found = [_error_details({**each, "loc": (name, *each["loc"])}) for each in error.errors()]
-        raise ValidationError.from_exception_data(name, found) from None
-
-
-def _section_error(name: str, kind: str, values: object) -> ValidationError:
-    error = ErrorDetails(type=kind, loc=(name,), msg=kind, input=values)
-    return ValidationError.from_exception_data(name, [_error_details(error)])
+def _to_mapping(section: object) -> object:
+    """Return a section as a file has it; null is an empty one."""
+    return section.model_dump() if isinstance(section, BaseModel) else section or {}
 
 
 def _error_details(error: ErrorDetails) -> InitErrorDetails:

@@ -40,7 +40,7 @@ GUIDE = "docs/guide/photographs.md"
 
 
 def find_reader(
-    config: DataConfig, sections: Mapping[str, BaseModel | None] = MappingProxyType({})
+    config: DataConfig, sections: Mapping[str, BaseModel] = MappingProxyType({})
 ) -> tuple[str, DatasetReader]:
     """Return name and reader of ``data.type``, or of the first that recognizes the folder.
 

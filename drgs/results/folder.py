@@ -320,7 +320,7 @@ def _values(config: FitConfig) -> dict[str, object]:
     """Return all values that determine a fit, without sections of strategies that are not used."""
     unused = config.densify.sections.keys() - {config.densify.strategy}
     ignored = {"output": True, "data": {"in_memory"}, "densify": unused}
-    off = {n: True for n, each in config.sections.items() if each is not None and each.is_off}
+    off = {n: True for n, each in config.sections.items() if each.is_off}
     return config.model_dump(mode="json", exclude={**ignored, **off})
 
 
