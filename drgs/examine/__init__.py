@@ -1,4 +1,4 @@
-"""Find out which effects photographs call for.
+"""``drgs examine``: the effects that photographs need, and the function ``drgs.examine``.
 
 Python gives ``drgs.examine`` to this package as soon as one of its modules is imported: so the
 package can be called, and stands for :func:`drgs.examine.examination.examine`.

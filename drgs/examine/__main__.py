@@ -1,4 +1,4 @@
-"""``drgs examine FOLDER``: which effects photographs call for, and the evidence.
+"""``drgs examine FOLDER``: which effects photographs need, and the evidence.
 
 Runs :func:`drgs.examine.examination.examine`, as ``drgs fit FOLDER`` does at its start.
 """
@@ -28,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.description = (
-        "Find out which effects photographs call for, by short fits that leave some of them out. "
+        "Find out which effects photographs need, by short fits that leave some of them out. "
         "Writes nothing. `drgs fit FOLDER` begins with the same."
     )
     parser.show_examples("%(prog)s photographs")

@@ -100,11 +100,6 @@ def _add_viewing(parser: CommandParser) -> None:
         help="show the running fit on a web page, with buttons to pause and end it (extra: viewer)",
     )
     group.add_argument(
-        "--view-address",
-        metavar="ADDRESS",
-        help="address of the page (default: 127.0.0.1, reachable from this machine only)",
-    )
-    group.add_argument(
         "--view-port",
         type=bounded_int(1, MAX_PORT),
         metavar="N",
@@ -122,10 +117,8 @@ def run(args: argparse.Namespace) -> None:
     started = time.perf_counter() - LOADING_SECONDS
     comm = communicator(args)
     budget = None if args.budget is None else Budget(args.budget, started + args.budget)
-    with execution_settings(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
-        session = FitSession(
-            None, variant=args.variant, budget=budget, check_ranges=check_ranges, comm=comm
-        )
+    with execution_settings(args.threads, args.debug), ExitStack() as blocks:
+        session = FitSession(None, variant=args.variant, budget=budget, comm=comm)
         if not comm.is_root:
             session.run()
             return
@@ -187,21 +180,19 @@ def add_observers(
         trainer = session.trainer
         viewer, session.continues = watch(server, trainer, trainer.dataset, session.continues)
         session.observers.append(viewer)
-        print(f"look on at {url(server)}", flush=True)
+        print(f"live view: {url(server)}", flush=True)
 
 
 def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer | None]:
     """Return the server of ``--view``'s page; None without it."""
     if not args.view:
-        for name in ("address", "port"):
-            if getattr(args, f"view_{name}") is not None:
-                raise UserError(f"--view-{name}: needs --view")
+        if args.view_port is not None:
+            raise UserError("--view-port: needs --view")
         return nullcontext()
     require_module("viser", "viewer", "--view")
-    from drgs.live_page.server import ADDRESS, run_server
+    from drgs.live_page.server import run_server
 
-    options = ("--view-address", "--view-port")
-    return run_server(args.view_address or ADDRESS, args.view_port, options)
+    return run_server(args.view_port, "--view-port")
 
 
 def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:

@@ -20,7 +20,7 @@ import mitsuba as mi
 
 from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.core.errors import PluginError
-from drgs.core.memory import MAX_LANES, UNASKED_BYTES, available_memory, too_large_reason
+from drgs.core.memory import MAX_LANES, UNCHECKED_BYTES, available_memory, too_large_reason
 from drgs.core.types import Float
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
@@ -212,7 +212,7 @@ def check_image(
     if why is not None:
         raise PluginError(f"splats: {why}")
     samples, most = width * height * nested_spp, MAX_LANES
-    if samples * NESTED_SAMPLE_BYTES > UNASKED_BYTES:
+    if samples * NESTED_SAMPLE_BYTES > UNCHECKED_BYTES:
         most = min(most, available_memory() // NESTED_SAMPLE_BYTES)
     if samples > most:
         raise PluginError(

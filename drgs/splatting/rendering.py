@@ -412,7 +412,8 @@ def _splat_tangents(
 ) -> SplatGradients:
     """Return tangents of the 2D splats, given those of the parameters, by Dr.Jit."""
     pipeline, with_camera = frame.pipeline, camera_tangents is not None
-    rows, d_rows = (load_rows(each, pipeline.sh_degree) for each in (gaussians, tangents))
+    rows = load_rows(gaussians, pipeline.sh_degree)
+    d_rows = load_rows(tangents, pipeline.sh_degree)
     with dr.resume_grad():
         inputs, _, outputs = _attach(rows, frame.camera, pipeline, with_camera)
         dr.set_grad(inputs, (pipeline.select_differentiable(d_rows), camera_tangents or []))

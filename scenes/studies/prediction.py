@@ -33,19 +33,25 @@ import numpy as np
 from drgs.bench.output import machine, markdown_table
 from drgs.bench.scenes import (
     BENCH_FIELD_OF_VIEW,
-    Scene,
     bench_camera,
-    bench_config,
     bench_gaussians,
-    frame_of,
 )
-from drgs.bench.timing import STAGES, StageClock, clocked_step, steps, warm_trainer
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 from drgs.reference.splatting import Camera
 from drgs.splatting.rendering import on_film
 from drgs.training.trainer import Trainer
 from kernels import Launch, counted_launches, vector_trips, vector_width
+from stages import (
+    STAGES,
+    Scene,
+    StageClock,
+    bench_config,
+    clocked_step,
+    frame_of,
+    steps,
+    warm_trainer,
+)
 
 ROUNDS = 6
 
@@ -182,7 +188,7 @@ def measure_costs(task: Task) -> Costs:
         pose, focal = view.camera_to_world, view.fx
         middle = task.size_px / 2, task.size_px / 2, task.size_px, task.size_px
         camera = Camera(pose[:3, :3].T, pose[:3, 3], focal, focal, *middle)
-        bins = frame_of(Scene(view.name, gaussians, camera)).bins
+        bins = frame_of(Scene(view.name, gaussians, camera)).tiles.bins
         splats.append(int(dr.count(on_film(bins))[0]))
     dataset = Dataset(views, views[:1], "bench", (1.0, 1.0, 1.0), None, "bench")
     trainer = Trainer(bench_config(gaussians), dataset, gaussians)

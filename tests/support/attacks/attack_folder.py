@@ -26,10 +26,9 @@ from plyfile import PlyData, PlyElement
 from drgs.capture import __main__ as capture
 from drgs.core.files import atomic_path
 from drgs.fit import __main__ as fit
-from drgs.results.files import CHECKPOINT, CURVES, ORBIT, ORBIT_GIF, REPORT, VIEWER
+from drgs.results.files import CHECKPOINT, CURVES, ORBIT, REPORT, VIEWER
 from support.attacks.attack import Fault, observed
 from support.commands import assert_ends_well, run_in_process
-from support.ksplat import content_of
 from support.small_capture import (
     HEIGHT,
     WIDTH,
@@ -127,7 +126,6 @@ def write_inputs(folder: Path) -> None:
     for suffix in (".ply", ".compressed.ply", ".spz", ".glb", ".sog"):
         blobs(12).save(folder / f"gaussians{suffix}")
     replace(blobs(12), shN=np.zeros((12, 0, 3), np.float32)).save(folder / "gaussians.splat")
-    (folder / "gaussians.ksplat").write_bytes(content_of([(blobs(12), 1)], 1))
     (folder / "fit.yml").write_text(yaml.safe_dump(SETTINGS))
     (folder / "photos.yml").write_text(yaml.safe_dump(SETTINGS | PHOTOGRAPHS))
     frame = {"transform_matrix": _pose(0.5)}
@@ -156,7 +154,7 @@ def stub_results() -> Iterator[None]:
     """Within the block a fit writes its drawings, but does not draw: that takes seconds."""
 
     def write(out: Path, *others: object) -> None:
-        for name in (CURVES, ORBIT, ORBIT_GIF, REPORT, VIEWER):
+        for name in (CURVES, ORBIT, REPORT, VIEWER):
             with atomic_path(out / name) as temporary:
                 temporary.write_text("a sketch")
 

@@ -49,7 +49,6 @@ READERS = {
     "gaussians.spz": ("render", "gaussians.spz", *CAMERA),
     "gaussians.glb": ("render", "gaussians.glb", *CAMERA),
     "gaussians.sog": ("render", "gaussians.sog", *CAMERA),
-    "gaussians.ksplat": ("render", "gaussians.ksplat", *CAMERA),
     "gaussians.splat": ("render", "gaussians.splat", *CAMERA),
     "camera.json": ("render", "gaussians.ply", "--camera", "camera.json", "--out", "out"),
     "sky.png": ("render", "gaussians.ply", *CAMERA, "--background", "sky.png"),
