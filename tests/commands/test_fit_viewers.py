@@ -95,7 +95,7 @@ def test_ending_early_leaves_a_finished_fit(tmp_path, viewer_page, monkeypatch, 
     assert viewer_page.show.call_count == 5
     assert ("finished" in assert_fits("--resume", out).stdout) != killed
     metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["iterations"] == metrics["config"]["iterations"] == 5
+    assert metrics["iterations"] == metrics["config"]["stop_after"] == 5
     assert load_config(out / "config.yml").last_iteration == 5
     assert not (out / "checkpoint.npz").exists()
     assert_fits(out / "config.yml", "--out", tmp_path / "again")

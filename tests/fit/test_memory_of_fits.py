@@ -219,7 +219,7 @@ def test_the_peak_of_a_fit_is_within_a_quarter_of_the_estimate(
     }
     (tmp_path / "a.yml").write_text(yaml.safe_dump(config))
     arguments = ["a.yml", "--out", "out"]
-    target_bytes = TARGET_BYTES * size * size * views
+    target_bytes = in_memory * TARGET_BYTES * size * size * views  # else none stay
     script = f"import sys; sys.argv[1:] = {arguments}; TARGET_BYTES = {target_bytes}\n{MEASURED}"
     done = run_python(script, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
