@@ -227,9 +227,10 @@ def random_scene(case: Case) -> Values:
 
 
 def _weights(case: Case) -> np.ndarray:
-    """Return random weights (5, H * W) of a loss; zero near thresholds and without a reference."""
+    """Return random weights (P, H * W) of a loss; zero near thresholds and without a reference."""
     planes = 5 if case.reference is None else len(case.reference_image[0])
-    weights = single(np.random.default_rng(2).normal(size=(5, case.width * case.height)))
+    shape = max(5, planes), case.width * case.height
+    weights = single(np.random.default_rng(2).normal(size=shape))
     weights[planes:] = 0
     return weights * ~case.near_threshold
 

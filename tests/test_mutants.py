@@ -12,8 +12,9 @@ what it returns. ``pytest tests/test_mutants.py -m slow -n 0 -s`` shows what not
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import drjit as dr
@@ -22,9 +23,9 @@ import pytest
 from drjit.llvm.ad import Float64
 from support import loss_checks, special_checks
 from support.cases import CASES
-from support.detectors import Detector, Outcome, find_noticed
 from support.instrumented import Instrumented
-from support.mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Switchboard
+from support.kernels import kernels_of
+from support.mutants import ALWAYS, AT_EQUALITY, NEGATED, NEVER, SCALED, Mutant, Switchboard
 
 from drgs.accuracy import exact, pixel_order, ray_colors
 from drgs.splatting import footprint, order, rasterize, reduction, rendering
@@ -156,6 +157,62 @@ class Copies:
 # ----------------------------------------------------------------------------------------------
 # What notices mutants
 # ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A test of the suite that is to notice mutants."""
+
+    name: str
+    check: Callable[[], None]
+
+    def notices(self) -> bool:
+        """Whether the check fails. An error that is no failed comparison is passed on."""
+        try:
+            with np.errstate(all="ignore"):
+                self.check()
+        except (AssertionError, pytest.fail.Exception):
+            return True
+        return False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The results of all mutants."""
+
+    board: Switchboard
+    detectors: list[str]
+    false_alarms: list[str]  # detectors that fail without a mutant
+    noticed_by: dict[Mutant, list[str]]
+
+    @property
+    def table(self) -> str:
+        """A line for each mutant."""
+        lines = [
+            f"{str(mutant)[:110]:110}  {mutant.change:11}  {', '.join(names) or '-'}"
+            for mutant, names in self.noticed_by.items()
+        ]
+        reasons = Counter(reason for _, _, reason in self.board.left_out)
+        lines += [f"left out {count:3}: {reason}" for reason, count in reasons.items()]
+        return "\n".join(lines)
+
+
+def find_noticed(board: Switchboard, general: list[Detector], special: list[Detector]) -> Outcome:
+    """Ask about each mutant ``general`` detectors, then, if none noticed it, ``special`` ones."""
+    false_alarms, reached, noticed_by = [], {}, {}
+    for detector in (*general, *special):
+        fails, reached[detector.name] = board.record(detector.notices)
+        if fails:
+            false_alarms.append(detector.name)
+    for mutant in board.mutants:
+        board.apply(mutant)
+
+        def ask(group: list[Detector], mutant: Mutant = mutant) -> list[str]:
+            return [d.name for d in group if mutant.switch in reached[d.name] and d.notices()]
+
+        noticed_by[mutant] = ask(general) or ask(special)
+    board.apply(None)
+    return Outcome(board, list(reached), false_alarms, noticed_by)
 
 
 class RememberedCase(Case):
@@ -335,6 +392,10 @@ FUNCTIONS = """
 """Functions that have mutants, at least these: derivatives are found by their callers."""
 
 
+def _key(mutant: Mutant) -> tuple[str, str, str, str]:
+    return mutant.site.function, mutant.site.text, mutant.part, mutant.change
+
+
 @pytest.mark.slow
 class TestMutants:
     def test_nothing_is_noticed_without_a_mutant(self):
@@ -343,15 +404,18 @@ class TestMutants:
 
     def test_every_mutant_is_noticed(self):
         print(f"\n{outcome().table}\n{len(outcome().noticed_by)} mutants")
-        survivors = outcome().survivors(EQUIVALENT)
+        unnoticed = [mutant for mutant, names in outcome().noticed_by.items() if not names]
+        survivors = [f"{m}  {m.change}" for m in unnoticed if _key(m) not in EQUIVALENT]
         assert not survivors, "noticed by nobody:\n" + "\n".join(survivors)
 
     def test_equivalent_mutants_exist_and_are_not_noticed(self):
         """Otherwise the reason for leaving them out no longer holds."""
-        assert outcome().noticing(EQUIVALENT) == {key: [] for key in EQUIVALENT}
+        noticed_by = {_key(mutant): names for mutant, names in outcome().noticed_by.items()}
+        assert {key: noticed_by.get(key) for key in EQUIVALENT} == {key: [] for key in EQUIVALENT}
 
     def test_every_law_and_case_notices_a_mutant(self):
-        assert outcome().busy_detectors == set(outcome().detectors)
+        busy = {name for names in outcome().noticed_by.values() for name in names}
+        assert busy == set(outcome().detectors)
 
     def test_derivatives_have_mutants(self):
         scaled = {m.site.function for m in outcome().noticed_by if m.change == SCALED}
@@ -359,10 +423,8 @@ class TestMutants:
 
     def test_every_site_is_evaluated(self):
         """A partial that no case reaches would have no mutant."""
-        idle = {
-            site.partition(":")[0] + site.partition("  ")[2]: site for site in outcome().idle_sites
-        }
-        assert set(idle) == set(ELSEWHERE), "\n".join(outcome().idle_sites)
+        idle = {f"{s.function}{s.text}" for s in outcome().board.sites if not s.evaluated}
+        assert idle == set(ELSEWHERE)
 
 
 @pytest.mark.parametrize("check", special_checks.CHECKS, ids=lambda check: check.__name__)
@@ -443,10 +505,7 @@ def test_mutants_compile_no_kernel():
     arguments = [dr.opaque(Float64, value, 4) for value in (2, 3, 5)]
 
     def kernels():
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            dr.eval(adjoint(*arguments))
-            return [kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])]
+        return kernels_of(lambda: dr.eval(adjoint(*arguments)))
 
     first = kernels()
     assert first

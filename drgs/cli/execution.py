@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
+from typing import TextIO, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -33,7 +34,7 @@ def add_execution_arguments(
     parser.add_argument(
         "--debug",
         action="store_true",
-        help="check the bounds of every memory access, and report violations; slow",
+        help="check the bounds of every memory access, and stop at the first violation; slow",
     )
 
 
@@ -57,18 +58,23 @@ def select_variant(name: str) -> None:
 
 
 @contextmanager
-def execution_settings(threads: int | None, debug: bool) -> Iterator[None]:
+def execution_settings(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
     """Run the block on ``threads`` threads (None: as many as now), with range checks if ``debug``.
 
-    Dr.Jit masks an access out of range, and reports it on standard error.
+    Yields a function, also called at the end, that raises :class:`UserError` after an access out of
+    range.
     """
-    tracer = sys.gettrace()  # debug mode installs its own
-    try:
-        range_checks = dr.scoped_set_flag(dr.JitFlag.Debug) if debug else nullcontext()
-        with _thread_count(threads), denormals_flushed(), range_checks:
-            yield
-    finally:
-        sys.settrace(tracer)
+    with _thread_count(threads), denormals_flushed():
+        if not debug:
+            yield lambda: None
+            return
+        reports, tracer = _RangeReports(sys.stderr), sys.gettrace()  # debug mode installs its own
+        try:
+            with redirect_stderr(cast("TextIO", reports)), dr.scoped_set_flag(dr.JitFlag.Debug):
+                yield reports.check
+                reports.check()
+        finally:
+            sys.settrace(tracer)
 
 
 @contextmanager
@@ -85,3 +91,28 @@ def _thread_count(count: int | None) -> Iterator[None]:
         yield
     finally:
         dr.set_thread_count(previous)
+
+
+class _RangeReports:
+    """A text stream that records Dr.Jit's reports of accesses out of range, which it masks."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._reports: list[str] = []
+
+    def write(self, text: str) -> int:
+        """Pass on ``text``."""
+        if "out-of-bounds" in text:
+            self._reports.append(one_line(text))
+        return self._stream.write(text)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._stream, name)
+
+    def check(self) -> None:
+        """Raise :class:`UserError` with the first report, if there is one."""
+        dr.sync_thread()
+        if self._reports:
+            raise UserError(
+                f"--debug: {self._reports[0]}; this is a defect of the program: please report it"
+            )

@@ -117,8 +117,10 @@ def run(args: argparse.Namespace) -> None:
     started = time.perf_counter() - LOADING_SECONDS
     comm = communicator(args)
     budget = None if args.budget is None else Budget(args.budget, started + args.budget)
-    with execution_settings(args.threads, args.debug), ExitStack() as blocks:
-        session = FitSession(None, variant=args.variant, budget=budget, comm=comm)
+    with execution_settings(args.threads, args.debug) as check_ranges, ExitStack() as blocks:
+        session = FitSession(
+            None, variant=args.variant, budget=budget, check_ranges=check_ranges, comm=comm
+        )
         if not comm.is_root:
             session.run()
             return

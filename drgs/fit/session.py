@@ -96,6 +96,7 @@ class FitSession:
     uses_terminal: bool = False  # prints, draws progress, and takes Ctrl-C as a request to stop
     variant: str | None = None  # of Mitsuba; None: the active one
     budget: Budget | None = None  # the time for which the fit is planned
+    check_ranges: Callable[[], None] = lambda: None  # called after each iteration
     on_start: Callable[[FitSession], None] = lambda session: None  # before the first iteration
     comm: Communicator = field(default_factory=Communicator)
     strategy: DensityStrategy | None = None  # None: the configured one
@@ -275,6 +276,7 @@ class FitSession:
                 observers.insert(0, ProgressLine(blocks.enter_context(progress)))
                 blocks.enter_context(stop)
             for done in iterations(trainer, self.history, self.continues):
+                self.check_ranges()
                 for observer in observers:
                     observer.after_iteration(trainer, self.history, done, lambda: stop.requested)
                 stops = bool(comm.broadcast_numbers(stop.requested))

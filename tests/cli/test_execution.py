@@ -8,11 +8,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.fit_command import assert_fits, without_images, write_project
+from support.commands import run_in_process
+from support.fit_command import assert_fits, run_fit, without_images, write_project
+from support.folders import visible
+from support.small_capture import blobs
 
 from drgs.cli.execution import execution_settings
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import Gaussians
+from drgs.render import __main__ as render
+from drgs.render import images
 from drgs.training.trainer import Trainer
 
 DEBUG = dr.JitFlag.Debug
@@ -55,17 +60,27 @@ def test_settings_hold_within_the_block():
 
 
 @pytest.mark.parametrize(
-    ("access", "report"),
+    ("access", "line", "report"),
     [
-        (read_beyond_the_end, "drjit.gather(): out-of-bounds read from position 7 in an array"),
-        (write_beyond_the_end, "drjit.scatter(): out-of-bounds write to position 9 in an array"),
+        (read_beyond_the_end, 1, "drjit.gather(): out-of-bounds read from position 7 in an array"),
+        (write_beyond_the_end, 2, "drjit.scatter(): out-of-bounds write to position 9 in an array"),
     ],
 )
-def test_out_of_range_access_is_reported_and_masked(capsys, access, report):
-    with execution_settings(threads=None, debug=True):
+def test_out_of_range_access_is_reported(capsys, access, line, report):
+    with (
+        pytest.raises(UserError) as error,
+        execution_settings(threads=None, debug=True) as check_ranges,
+    ):
+        check_ranges()
         access()
-        dr.sync_thread()
-    assert f"{report} of size 3. (test_execution.py:" in capsys.readouterr().err
+        with pytest.raises(UserError, match="out-of-bounds"):
+            check_ranges()  # before the end
+    line += access.__code__.co_firstlineno
+    assert str(error.value).startswith(f"--debug: {report} of size 3. (test_execution.py:{line}); ")
+    assert report in capsys.readouterr().err  # at once, where it happened
+    with pytest.raises(ZeroDivisionError), execution_settings(threads=None, debug=True):
+        access()
+        1 / 0  # noqa: B018
 
 
 @pytest.mark.skipif(
@@ -92,17 +107,18 @@ def test_refused_number_of_threads_is_a_user_error(monkeypatch):
         pass
 
 
+def after_each_step(monkeypatch, act):
+    step = Trainer.step
+    monkeypatch.setattr(Trainer, "step", lambda trainer: (step(trainer), act(trainer))[0])
+
+
 @pytest.mark.slow
-def test_fit_with_range_checks_has_the_same_bytes_and_no_reports(tmp_path, monkeypatch):
+def test_fit_with_range_checks_gives_the_same_bytes_or_stops(tmp_path, monkeypatch):
     """Across a change of the population, of the SH degree, and an opacity reset."""
     without_images(monkeypatch)
-    config, step, flags = write_project(tmp_path, iterations=3), Trainer.step, []
-
-    def recorded(trainer):
-        flags.append(dr.flag(DEBUG))
-        return step(trainer)
-
-    monkeypatch.setattr(Trainer, "step", recorded)
+    config = write_project(tmp_path, iterations=3, output={"checkpoint_every": 1})
+    flags = []
+    after_each_step(monkeypatch, lambda trainer: flags.append(dr.flag(DEBUG)))
     for name, options in (("plain", []), ("checked", ["--debug", "--threads", "1"])):
         outcome = assert_fits(config, "--out", tmp_path / name, *options)
         assert "out-of-bounds" not in outcome.stderr
@@ -111,3 +127,19 @@ def test_fit_with_range_checks_has_the_same_bytes_and_no_reports(tmp_path, monke
     for name in ("point_cloud.ply", "renders/test/r_0.png"):
         plain, checked = ((tmp_path / run / name).read_bytes() for run in ("plain", "checked"))
         assert plain == checked, name
+
+    after_each_step(monkeypatch, lambda t: t.iteration == 2 and read_beyond_the_end())
+    message = "error: --debug: drjit.gather(): out-of-bounds read from position 7"
+    outcome, out = run_fit(config, "--out", tmp_path / "out", "--debug"), tmp_path / "out"
+    assert outcome.returncode == 2 and message in outcome.stderr
+    assert visible(out) == {"checkpoint.npz", "config.yml"}
+    assert np.load(out / "checkpoint.npz")["trainer.iteration"] == 1
+
+
+def test_render_fails_after_out_of_range_access(tmp_path, monkeypatch):
+    blobs().save(tmp_path / "blobs.ply")
+    monkeypatch.setattr(images, "render_cameras", lambda *_: [read_beyond_the_end()])
+    words = (tmp_path / "blobs.ply", "--origin", 0, -4, 1, "--out", tmp_path / "out", "--debug")
+    message = "--debug: drjit.gather(): out-of-bounds read from position 7"
+    outcome = run_in_process(render.main, *words)
+    assert outcome.returncode == 2 and f"error: {message}" in outcome.stderr

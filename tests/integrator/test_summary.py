@@ -157,16 +157,16 @@ def test_plan_of_views_covers_all_views():
 
 def test_plan_of_sensors_covers_all_sensors():
     """A pinhole; one that is bent and moves; a thin lens; an orthographic one."""
-    to_world = {key: VIEWS[1].sensor()[key] for key in ("to_world", "film", "sampler")}
     close = {"to_world_close": VIEWS[0].sensor()["to_world"]}
-    thin = {"aperture_radius": 0.1, "focus_distance": 2.0}
-    sensors = [
-        VIEWS[1].sensor(),
-        {"type": "calibrated", **to_world, "lens": "opencv", "k1": 0.1, **close},
-        {"type": "thinlens", **to_world, "fov": 40.0, **thin},
-        {"type": "orthographic", **to_world},
+    thin = {"fov": 40.0, "aperture_radius": 0.1, "focus_distance": 2.0}
+    views = [
+        VIEWS[1],
+        VIEWS[1].with_sensor("calibrated", lens="opencv", k1=0.1, **close),
+        VIEWS[1].with_sensor("thinlens", **thin),
+        VIEWS[1].with_sensor("orthographic"),
     ]
-    cameras = [camera_from_sensor(read_sensor(mi.load_dict(s), 0.01)) for s in sensors]
+    sensors = [mi.load_dict(view.sensor()) for view in views]
+    cameras = [camera_from_sensor(read_sensor(sensor, 0.01)) for sensor in sensors]
 
     def lines(integrator, **surfaces):
         plan = summary_of_sensors(integrator.state, cameras, None, **surfaces)

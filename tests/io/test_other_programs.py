@@ -22,6 +22,7 @@ from support.formats import (
     matched,
     turned,
 )
+from support.ksplat import content_of
 
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.compressed_ply import CompressedPly
@@ -54,7 +55,6 @@ COARSE = replace(
     means=2.0**-12 / 2 + 4 * FLOAT32,  # always 12 bits behind the point
     harmonics=np.sqrt(7) * (1 / 256 + 16 / 256) + 4 * FLOAT32,  # 4 of 8 bits
 )
-
 
 TRUNCATED = replace(
     PRECISION["sog"],
@@ -107,6 +107,16 @@ def test_files_of_splat_transform_are_read(tmp_path, suffix, options, rotation, 
     convert(tmp_path / "ours.ply", path, *options)
     expected = turned(Gaussians.load(tmp_path / "ours.ply"), rotation)
     assert_within(precision, expected, matched(expected, Gaussians.load(path)))
+
+
+@splat_transform
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_ksplat_files_are_read_as_splat_transform_reads_them(tmp_path, level):
+    gaussians = gaussians_within_ranges(100, degree=2)
+    (tmp_path / "a.ksplat").write_bytes(content_of([(gaussians, 5)], level))
+    convert(tmp_path / "a.ksplat", tmp_path / "theirs.ply")
+    found, expected = (Gaussians.load(tmp_path / name) for name in ("a.ksplat", "theirs.ply"))
+    assert_within(ALIKE, expected, matched(expected, found))
 
 
 FLOATS = Precision(*(40 * FLOAT32,) * 4, 10 * FLOAT32, 40 * FLOAT32)

@@ -5,7 +5,7 @@ import numpy as np
 from drgs.datasets.types import Dataset, View
 from support.datasets import look_at
 from support.lens_scenes import PINHOLE, kernel_lens
-from support.small_fits import reference_camera
+from support.small_capture import reference_camera
 
 WHITE = (1.0, 1.0, 1.0)
 DISTANCE = 4.0
