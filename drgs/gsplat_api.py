@@ -45,33 +45,20 @@ MIN_SCALE = 1e-18  # world units: its square is not 0 in float32
 MAX_SKEW = 1e-6  # relative to the largest number in K: rounding
 OPAQUE_LOGIT = 100.0  # its sigmoid is 1 in float64
 
-MITSUBA_CAMERAS = (
-    "leave it out for pinholes at rest; other cameras are Mitsuba's sensors, which mi.render takes "
-    "with the integrator splats"
-)
-
-UNSUPPORTED_GSPLAT_ARGUMENTS = {
+GSPLAT_REMEDIES = {
     "far_plane": "leave out the Gaussians beyond it",
     "radius_clip": "leave it out: small splats cost little",
-    "packed": "leave it out: results have a row for each Gaussian",
-    "sparse_grad": "leave it out: gradients have a row for each Gaussian",
+    "packed sparse_grad": "leave it out: results and gradients have a row for each Gaussian",
     "absgrad": "leave it out: gradients are summed with their signs",
     "covars": "give quats and scales",
     "with_ut": 'give projection="unscented"',
     "with_eval3d": 'give projection="exact"',
-    "tile_size": "leave it out",
-    "channel_chunk": "leave it out",
-    "distributed": "leave it out",
-    "segmented": "leave it out",
-    "camera_model": MITSUBA_CAMERAS,
-    "radial_coeffs": MITSUBA_CAMERAS,
-    "tangential_coeffs": MITSUBA_CAMERAS,
-    "thin_prism_coeffs": MITSUBA_CAMERAS,
-    "ftheta_coeffs": MITSUBA_CAMERAS,
-    "rolling_shutter": MITSUBA_CAMERAS,
-    "viewmats_rs": MITSUBA_CAMERAS,
+    "tile_size channel_chunk distributed segmented": "leave it out",
+    "camera_model radial_coeffs tangential_coeffs thin_prism_coeffs ftheta_coeffs rolling_shutter "
+    "viewmats_rs": "leave it out for pinholes at rest; other cameras are Mitsuba's sensors, which "
+    "mi.render takes with the integrator splats",
 }
-"""Parameters of gsplat that drgs does not have, and remedies."""
+"""Remedies by the parameters of gsplat, separated by spaces, that drgs does not have."""
 
 SHAPES: dict[str, list[tuple[str | int, ...]]] = {
     "means": [("N", 3)],
@@ -197,9 +184,9 @@ def _approximations(
     known = {f.name for f in fields(Approximations)} - {"low_pass", "antialiased"}
     for name in others.keys() - known:
         reason = f"there is no parameter {name}{did_you_mean(name, known)}"
-        if name in UNSUPPORTED_GSPLAT_ARGUMENTS:
-            remedy = UNSUPPORTED_GSPLAT_ARGUMENTS[name]
-            reason = f"{name} is a parameter of gsplat's that drgs does not have; {remedy}"
+        for theirs, remedy in GSPLAT_REMEDIES.items():
+            if name in theirs.split():
+                reason = f"{name} is a parameter of gsplat's that drgs does not have; {remedy}"
         raise TypeError(f"rasterization(): {reason}")
     if others.get("sh_direction", "mean") != "mean" and sh_degree is None:
         raise ValueError(
@@ -352,15 +339,15 @@ class _Planes(dr.CustomOp):
     def backward(self) -> None:
         grad_out: Any = self.grad_out()  # as of :meth:`eval`
         all_d_planes, d_backgrounds = grad_out
-        found: dict[str, list] = {name: [] for name in self.inputs}
+        parts_by_name: dict[str, list] = {name: [] for name in self.inputs}
         for view, d_planes in zip(self.views, all_d_planes, strict=True):
             for name, gradient in view.gradients(d_planes).items():
-                found[name].append(gradient)
-            dr.eval(found)
+                parts_by_name[name].append(gradient)
+            dr.eval(parts_by_name)
         if d_backgrounds:
-            found["backgrounds"] = d_backgrounds
+            parts_by_name["backgrounds"] = d_backgrounds
         gradients = {}
-        for name, parts in found.items():
+        for name, parts in parts_by_name.items():
             shape, flat = self.inputs[name].shape, [cast(Float, dr.ravel(part)) for part in parts]
             is_shared = dr.width(flat[0]) == math.prod(shape)
             total = sum(flat[1:], flat[0]) if is_shared else dr.concat(flat)
@@ -410,10 +397,10 @@ class _View:
     def gradients(self, d_planes: list[Float]) -> dict[str, TensorXf | Float]:
         """Return gradients of the inputs from those of the planes."""
         dr.eval(d_planes)
-        found = frames_adjoint(
+        adjoint = frames_adjoint(
             self.gaussians, [self.frame], [d_planes], self.film.is_camera_attached
         )
-        d, t = found.parameters, self.types
+        d, t = adjoint.parameters, self.types
         assert d is not None and d.features is not None, "of self.gaussians, projected here"
         gradients: dict[str, TensorXf | Float] = {
             "means": d.means,
@@ -424,8 +411,8 @@ class _View:
             "viewmats": dr.zeros(t.Float, 16),
             "Ks": dr.zeros(t.Float, 9),
         }
-        if found.camera is not None:
-            gradients |= self._camera_gradients(np.array([number[0] for number in found.camera]))
+        if adjoint.camera is not None:
+            gradients |= self._camera_gradients(np.array([number[0] for number in adjoint.camera]))
         return gradients
 
     def _gaussians(self, values: Mapping[str, TensorXf]) -> Gaussians:
@@ -479,14 +466,14 @@ def _meta(views: list[_View]) -> dict[str, Any]:
         splats = view.pipeline.project(rows, view.frame.camera)
         brightness = dr.log(splats.opacities / ALPHA_CUT)
         radii = dr.ceil(dr.sqrt(2 * brightness * splats.variances))
-        found = {
+        values_by_name = {
             "means2d": list(splats.means2d),
             "depths": [splats.depths],
             "conics": list(splats.conics),
             "opacities": [splats.opacities],
             "radii": [dr.select(splats.visible, r, 0) for r in radii],
         }
-        for name, values in found.items():
+        for name, values in values_by_name.items():
             columns.setdefault(name, []).append(interleave(values))
     dr.eval(columns)
     film, num = views[0].film, views[0].gaussians.num_gaussians

@@ -9,8 +9,6 @@ from drgs.cli.commands import CommandParser, Subcommand, run_command
 COMMANDS = {
     "speed": "times of drgs and of other renderers on the same scene, in one run",
     "accuracy": "error of each approximation against the time that it saves",
-    "effects": "cost of each effect: time and operations with and without it",
-    "scaling": "time and memory of a training iteration against the size of the problem",
     "stability": "error of float32 against float64 as scenes become harder",
 }  # descriptions by module
 

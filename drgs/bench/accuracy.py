@@ -3,17 +3,14 @@
 Compares renderings of a trained and a stress scene (wide lens, large splats near the camera,
 interpenetrating layers) with the most accurate form: the float64 numpy reference that evaluates
 splats and harmonics along each pixel's ray, sorts all splats at each pixel, and cuts only alphas
-below a millionth. What error budgets choose is measured like the other choices. A fit's images are
-also compared with the photographs. Tables have other images (another low-pass, samples per pixel,
-other SH) in brackets: their distance is not an error.
+below a millionth. What error budgets choose is measured like the other choices.
 """
 
 from __future__ import annotations
 
 import argparse
-import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +21,7 @@ import numpy as np
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.bench.output import add_out, machine, markdown_table, write_rows
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
-from drgs.bench.timing import count_operations, seconds
+from drgs.bench.timing import count_operations, time_in_turns
 from drgs.cameras.camera import Camera
 from drgs.cli.commands import CommandParser
 from drgs.config.approximations import Approximations
@@ -35,15 +32,14 @@ from drgs.datasets.types import View
 from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.error_budget import Renderer, Search
-from drgs.integrator.film import SamplePoints
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.results import metrics
 from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS
+from drgs.results.folder import require_results
 from drgs.results.model_arguments import error_budget
 from drgs.splatting import rendering
-from drgs.splatting.footprint import PixelCenters, SamplePositions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,7 +47,6 @@ if TYPE_CHECKING:
 PLOTS = ("accuracy.png", "accuracy_stress.png")  # of the given scene, and of the stress scene
 ROUNDS, QUICK_ROUNDS = 9, 3
 MARKER_PX = 15  # of the plot's marker of the default
-SLOW_S, SLOW_ROUNDS = 1.0, 2  # slower rungs are timed in SLOW_ROUNDS
 FILM_SIZE_PX = 400  # film of scenes without cameras
 CROP_SIZE_PX = 8  # side of the crops on which every pixel evaluates every splat
 MIN_ALPHA = 1e-6  # alpha cut of the most accurate form
@@ -69,9 +64,6 @@ class Rung:
 
     name: str
     approximations: Mapping[str, Any] = field(default_factory=dict)
-    is_approximation: bool = True  # of the most accurate form
-    samples: int = 1  # per pixel, a square number
-    sh_degree: int | None = None  # None: all
     float64: bool = False
 
 
@@ -93,13 +85,6 @@ RUNGS = (
     Rung("harmonics along each pixel's ray", {"sh_direction": "pixel"}),
     Rung("all of these", {**EXACT_PIXEL, "order_window": 16, "sh_direction": "pixel", **UNCUT}),
     Rung("default in float64", float64=True),
-    Rung("SH of degree 0", is_approximation=False, sh_degree=0),
-    Rung("SH of degree 1", is_approximation=False, sh_degree=1),
-    Rung("SH of degree 2", is_approximation=False, sh_degree=2),
-    Rung("antialiased low-pass", {"antialiased": True}, is_approximation=False),
-    Rung("no low-pass", {"low_pass": 0.0}, is_approximation=False),
-    Rung("4 samples, no low-pass", {"low_pass": 0.0}, False, samples=4),
-    Rung("16 samples, no low-pass", {"low_pass": 0.0}, False, samples=16),
 )
 
 
@@ -110,7 +95,6 @@ class Subject:
     name: str
     gaussians: Gaussians  # numpy
     cameras: list[reference.Camera]
-    photographs: list[View]  # may be empty
     background: tuple[float, float, float]
 
 
@@ -120,14 +104,12 @@ class AccuracyMeasurement:
 
     scene: str
     rung: str
-    is_approximation: bool
     milliseconds: float  # forward, median, per view
     both_milliseconds: float  # forward and backward
     operations: int  # in the kernels of a forward pass
     psnr: float  # dB, against the most accurate form
     ssim: float
     largest_error: float
-    photo_psnr: float | None  # dB, against the photographs
 
     @property
     def root_mean_square(self) -> float:
@@ -166,7 +148,7 @@ def run(args: argparse.Namespace) -> None:
     """Measure both scenes; write table, CSV and plots."""
     subjects = [
         load_subject(Path(args.scene), 1 if args.quick else args.views),
-        Subject("stress", *stress_scene(FILM_SIZE_PX), [], (0.0, 0.0, 0.0)),
+        Subject("stress", *stress_scene(FILM_SIZE_PX), (0.0, 0.0, 0.0)),
     ]
     print(f"{machine()}")
     results = []
@@ -180,9 +162,9 @@ def run(args: argparse.Namespace) -> None:
             flush=True,
         )
         rungs = [*RUNGS, *rungs_of_budgets(subject, args.error)]
-        found = measure(subject, accurate, rungs, QUICK_ROUNDS if args.quick else ROUNDS)
-        results += found
-        print(table(found), flush=True)
+        measured = measure(subject, accurate, rungs, QUICK_ROUNDS if args.quick else ROUNDS)
+        results += measured
+        print(table(measured), flush=True)
     write_rows(args.out / "accuracy.csv", AccuracyMeasurement, results)
     for subject, name in zip(subjects, PLOTS, strict=True):
         write_figure(args.out / name, plot([m for m in results if m.scene == subject.name]))
@@ -213,21 +195,17 @@ def load_subject(path: Path, num_views: int) -> Subject:
     """
     if not path.is_dir():
         camera = bench_camera(FILM_SIZE_PX)
-        return Subject(
-            path.stem, bake_smoothing(Gaussians.load(path)), [camera], [], (1.0, 1.0, 1.0)
-        )
+        return Subject(path.stem, bake_smoothing(Gaussians.load(path)), [camera], (1.0, 1.0, 1.0))
     ply, config_file = path / GAUSSIANS_FOR_VIEWERS, path / CONFIG
     ply = ply if ply.exists() else path / GAUSSIANS
-    for file in (ply, config_file):
-        if not file.exists():
-            raise UserError(f"{file}: not there; {path} must be the folder of a finished fit")
+    require_results(path, ply.name)
     config = load_config(str(config_file), [])
     gaussians = bake_smoothing(Gaussians.load(ply))
     dataset = load_dataset(config.data).relative_to(gaussians.origin)
     views = dataset.test[:: max(1, len(dataset.test) // num_views)][:num_views]
     _check_pinholes(views, config_file, ply)
     cameras = [camera_of(view, config.model.near_plane) for view in views]
-    return Subject(path.name, gaussians, cameras, list(views), dataset.background)
+    return Subject(path.name, gaussians, cameras, dataset.background)
 
 
 def _check_pinholes(views: Sequence[View], config_file: Path, ply: Path) -> None:
@@ -249,15 +227,6 @@ def camera_of(view: View, near: float) -> reference.Camera:
     return reference.Camera(rotation, center, fx, fy, cx, cy, view.width, view.height, near)
 
 
-def positions(samples: int, camera: reference.Camera, float_type: type) -> list[SamplePositions]:
-    """Return a grid of points in each pixel."""
-    if samples == 1:
-        return [PixelCenters()]
-    side, size = round(np.sqrt(samples)), camera.width * camera.height
-    offsets = [dr.opaque(float_type, (i + 0.5) / side, size) for i in range(side)]
-    return [SamplePoints(x, y) for y in offsets for x in offsets]
-
-
 @dataclass(frozen=True)
 class RungRenderer:
     """A rung, ready to render one view."""
@@ -265,7 +234,6 @@ class RungRenderer:
     rung: Rung
     gaussians: Gaussians  # on the device
     camera: Camera
-    positions: list[SamplePositions]
     background: tuple[float, float, float]
 
     @staticmethod
@@ -273,45 +241,34 @@ class RungRenderer:
         """Return the renderer of a subject in one of the accuracies."""
         Float = llvm.Float64 if rung.float64 else llvm.Float
         gaussians = subject.gaussians.to(llvm.TensorXf64 if rung.float64 else llvm.TensorXf)
-        points = positions(rung.samples, camera, Float)
-        return RungRenderer(
-            rung, gaussians, device_camera(camera, Float), points, subject.background
-        )
+        return RungRenderer(rung, gaussians, device_camera(camera, Float), subject.background)
 
-    def frames(self) -> list[rendering.Frame]:
+    def frame(self) -> rendering.Frame:
         """Render and synchronize."""
-        stored = self.gaussians.sh_degree
-        degree = stored if self.rung.sh_degree is None else min(stored, self.rung.sh_degree)
-        pipeline = pipeline_of(Approximations(**self.rung.approximations), degree)
-        first, *others = self.positions
-        model = replace(pipeline.model, positions=first)
-        frame = rendering.render(self.gaussians, self.camera, replace(pipeline, model=model))
-        again = [replace(model, positions=points) for points in others]
-        frames = [frame, *(rendering.render_again(frame, other) for other in again)]
-        dr.eval([f.planes() for f in frames])
+        approximations = Approximations(**self.rung.approximations)
+        pipeline = pipeline_of(approximations, self.gaussians.sh_degree)
+        frame = rendering.render(self.gaussians, self.camera, pipeline)
+        dr.eval(frame.planes())
         dr.sync_thread()
-        return frames
+        return frame
 
     def image(self) -> np.ndarray:
         """Return (H, W, 3) float64, display space, not clamped."""
         shape = self.camera.height, self.camera.width
-        images = []
-        for frame in self.frames():
-            T, *color = (np.array(p, np.float64).reshape(shape) for p in frame.planes())
-            images.append(np.stack(color, axis=-1) + T[..., None] * np.array(self.background))
-        return np.mean(images, axis=0)
+        T, *color = (np.array(p, np.float64).reshape(shape) for p in self.frame().planes())
+        return np.stack(color, axis=-1) + T[..., None] * np.array(self.background)
 
     def forward_backward(self) -> None:
         """Differentiate the sum of all planes."""
-        frames = self.frames()
+        frame = self.frame()
         ones = dr.ones(type(self.camera.near), self.camera.width * self.camera.height)
-        gradients = rendering.frames_adjoint(self.gaussians, frames, [[ones] * 4] * len(frames))
+        gradients = rendering.frames_adjoint(self.gaussians, [frame], [[ones] * 4])
         dr.eval(gradients.parameters)
         dr.sync_thread()
 
     def operations(self) -> int:
         """Count the operations in the kernels of a forward pass."""
-        return count_operations(self.frames)
+        return count_operations(self.frame)
 
 
 def most_accurate(
@@ -349,38 +306,23 @@ def measure(
     """Measure errors of all rungs, and their times on the first view, in turns."""
     renderers = [RungRenderer.from_rung(rung, subject, subject.cameras[0]) for rung in rungs]
     operations = [renderer.operations() for renderer in renderers]  # compiles the kernels
-    for renderer in renderers:
-        renderer.forward_backward()
-    slow = [seconds(renderer.frames) > SLOW_S for renderer in renderers]
-    times: list[list[tuple[float, float]]] = [[] for _ in rungs]
-    rng = np.random.default_rng(0)
-    for turn in range(rounds):
-        # In random order: caches depend on the previous call.
-        for k in rng.permutation(len(rungs)):
-            if turn < SLOW_ROUNDS or not slow[k]:
-                renderer = renderers[k]
-                times[k].append((seconds(renderer.frames), seconds(renderer.forward_backward)))
+    times = time_in_turns([(each.frame, each.forward_backward) for each in renderers], rounds)
     results = []
     for rung, count, spent in zip(rungs, operations, times, strict=True):
         images = [
             RungRenderer.from_rung(rung, subject, camera).image() for camera in subject.cameras
         ]
         pairs = list(zip(images, accurate, strict=True))
-        quality, views = metrics.mean_quality(pairs), subject.photographs
-        photos = [
-            (image, view.image, view.mask) for image, view in zip(images, views, strict=bool(views))
-        ]
+        quality = metrics.mean_quality(pairs)
         results.append(
             AccuracyMeasurement(
                 subject.name,
                 rung.name,
-                rung.is_approximation,
-                *(1e3 * statistics.median(times) for times in zip(*spent, strict=True)),
+                *(1e3 * np.median(spent, axis=0)).tolist(),
                 operations=count,
                 psnr=quality.psnr,
                 ssim=quality.ssim,
                 largest_error=max(np.abs(image - exact).max() for image, exact in pairs),
-                photo_psnr=metrics.mean_quality(photos).psnr if photos else None,
             )
         )
     return results
@@ -388,11 +330,8 @@ def measure(
 
 def pareto_front(results: Sequence[AccuracyMeasurement]) -> list[AccuracyMeasurement]:
     """Return the Pareto-optimal approximations in time and PSNR, fastest first."""
-    candidates = sorted(
-        (m for m in results if m.is_approximation), key=lambda m: (m.milliseconds, -m.psnr)
-    )
     front: list[AccuracyMeasurement] = []
-    for m in candidates:
+    for m in sorted(results, key=lambda m: (m.milliseconds, -m.psnr)):
         if not front or m.psnr > front[-1].psnr:
             front.append(m)
     return front
@@ -404,36 +343,33 @@ def table(results: Sequence[AccuracyMeasurement]) -> str:
     header = [first.scene, "forward", "forward + backward", "operations", "PSNR", "SSIM"]
     rows = [
         [
-            f"{m.rung}{' *' if m in front else ''}" if m.is_approximation else f"({m.rung})",
+            f"{m.rung}{' *' if m in front else ''}",
             f"{m.milliseconds:.0f} ms, {m.milliseconds / first.milliseconds:.2f}x",
             f"{m.both_milliseconds:.0f} ms, {m.both_milliseconds / first.both_milliseconds:.2f}x",
             f"{m.operations:,}",
             f"{m.psnr:.1f} dB",
             f"{m.ssim:.5f}",
             f"{m.largest_error:.2g}",
-            "" if m.photo_psnr is None else f"{m.photo_psnr:.2f} dB",
         ]
         for m in results
     ]
-    note = "* on the Pareto front of the approximations; (in brackets) other images"
-    table = markdown_table([*header, "largest error", "PSNR, photographs"], rows)
-    return f"{table}\n\n{note}"
+    table = markdown_table([*header, "largest error"], rows)
+    return f"{table}\n\n* on the Pareto front"
 
 
 def plot(results: Sequence[AccuracyMeasurement]) -> Figure:
     """Plot error over time of a scene; only the default and the Pareto front have names."""
     from matplotlib.ticker import NullLocator
 
-    approximations = [m for m in results if m.is_approximation]
-    default = approximations[0]
-    front = pareto_front([m for m in approximations if not m.rung.startswith(BUDGET)])
+    default = results[0]
+    front = pareto_front([m for m in results if not m.rung.startswith(BUDGET)])
     figure = new_figure(7.6, 4.2)
     axes = figure.subplots()
 
     def point(m: AccuracyMeasurement) -> tuple[float, float]:
         return m.milliseconds / default.milliseconds, 255 * m.root_mean_square
 
-    times, errors = zip(*map(point, approximations), strict=True)
+    times, errors = zip(*map(point, results), strict=True)
     axes.set(
         xscale="log", xlim=(min(times) / 4, max(times) * 1.5), xticks=(1, 10, 100),
         xlabel="time of a frame: times that of the default",
@@ -447,7 +383,7 @@ def plot(results: Sequence[AccuracyMeasurement]) -> Figure:
     axes.plot(times, errors, "o", color="0.8", markersize=5)
     axes.plot(*zip(*map(point, front), strict=True), "o-", color="C0", markersize=8, alpha=0.6)
     axes.plot(*point(default), "o", color="C3", markersize=12)
-    for m in approximations:
+    for m in results:
         if m.rung.startswith(BUDGET):
             budget = 255 * float(m.rung.removeprefix(BUDGET))
             axes.plot(*point(m), "s", color="C2", markersize=7)

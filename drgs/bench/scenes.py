@@ -1,24 +1,15 @@
-"""Scenes, cameras and trainers of the measurements; cameras are the reference's."""
+"""Scenes and cameras of the measurements; cameras are the reference's."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-
-import drjit.llvm.ad as llvm
 import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.axes import OPENCV_TO_OPENGL
 from drgs.cameras.camera import Camera
-from drgs.config.changes import with_changes
-from drgs.config.schema import FitConfig, ModelConfig
-from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import film_description
 from drgs.reference import splatting as reference
-from drgs.splatting import rendering
-from drgs.training.trainer import Trainer
 
 BENCH_TO_WORLD = np.array(
     [
@@ -91,68 +82,6 @@ def device_camera(camera: reference.Camera, float_type: type) -> Camera:
     return Camera.create(
         float_type, camera.rotation, camera.center, K, camera.width, camera.height, camera.near
     )
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Gaussians and a camera."""
-
-    name: str
-    gaussians: Gaussians  # numpy
-    camera: reference.Camera
-
-
-def frame_of(scene: Scene) -> rendering.Frame:
-    """Render the scene in single precision."""
-    pipeline = rendering.Pipeline(scene.gaussians.sh_degree)
-    camera = device_camera(scene.camera, llvm.Float)
-    return rendering.render(scene.gaussians.to(llvm.TensorXf), camera, pipeline)
-
-
-def view_of(scene: Scene) -> View:
-    """Return the scene's image shifted by a pixel, for derivatives of realistic size."""
-    camera = scene.camera
-    _, *planes = frame_of(scene).planes()
-    image = np.stack([np.array(p).reshape(camera.height, camera.width) for p in planes], axis=-1)
-    to_world = np.eye(4)
-    to_world[:3, :3], to_world[:3, 3] = camera.rotation.T, camera.center
-    photograph = np.clip(np.roll(image, 1, axis=1), 0, 1).astype(np.float32)
-    return View(
-        "bench", to_world, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
-        image=photograph,
-    )  # fmt: skip
-
-
-def trainer_of(
-    scene: Scene, changes: Mapping[str, object] = {}, extras: Mapping[str, np.ndarray] = {}
-) -> Trainer:
-    """Return a trainer on one view, with a fixed population whose statistics are gathered.
-
-    changes: of :func:`bench_config`; extras: of the view, besides colours.
-    """
-    view = replace(view_of(scene), **extras)
-    dataset = Dataset((view,), (view,), "bench", (1.0, 1.0, 1.0), None, "bench")
-    config = bench_config(scene.gaussians)
-    trainer = Trainer(with_changes(config, changes), dataset, scene.gaussians)
-    trainer.iteration = 10  # all SH degrees are in use
-    return trainer
-
-
-def bench_config(gaussians: Gaussians) -> FitConfig:
-    """Return the configuration of a fit that renders as 3DGS and keeps the population."""
-    model = ModelConfig(sh_degree=gaussians.sh_degree, sh_increase_every=1).with_3dgs_defaults()
-    values = {
-        "data": {"path": "."},
-        "model": model.model_dump(),
-        "densify": {
-            "start": 1_000_000,
-            "stop": 1_000_001,
-            "strategy": "adc",
-            "adc": {"reset_every": 1_000_000},
-        },
-        "iterations": 2_000_000,
-    }
-    return FitConfig.model_validate(values)
 
 
 def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Camera]]:

@@ -1,4 +1,4 @@
-"""``drgs bench speed``: drgs and other renderers side by side, and the stages of an iteration.
+"""``drgs bench speed``: drgs and other renderers side by side.
 
 One process measures all implementations with the same Gaussians, camera and loss. Each round times
 every implementation once, so that other load affects all of them. Medians and their ratios are
@@ -8,10 +8,8 @@ reported. ``--without-avx512`` measures kernels compiled for AVX2.
 from __future__ import annotations
 
 import argparse
-import json
-import statistics
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,11 +18,10 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.bench.output import add_out, machine, markdown_table, write_rows
-from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of, mitsuba_sensor
-from drgs.bench.timing import STAGES, Work, clocked_step, count_work, seconds, steps, warm_trainer
+from drgs.bench.scenes import bench_camera, bench_gaussians, mitsuba_sensor
+from drgs.bench.timing import time_in_turns
 from drgs.cli.commands import CommandParser
 from drgs.config.schema import ModelConfig
-from drgs.core.files import atomic_path
 from drgs.core.private import disable_avx512
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene
@@ -38,8 +35,6 @@ if TYPE_CHECKING:
 IMAGE_SIZE_PX = 400
 SHELL_STDS = 3.0  # extent of Mitsuba's ellipsoids, standard deviations (its default, and 3DGS's)
 ROUNDS, QUICK_ROUNDS = 15, 5
-SLOW_S, SLOW_ROUNDS = 0.5, 3
-VERY_SLOW_S = 15.0  # slower implementations are measured once
 
 
 @dataclass(frozen=True)
@@ -53,31 +48,10 @@ class Timing:
     rounds: int
 
 
-@dataclass(frozen=True)
-class IterationReport:
-    """A training iteration by stage; medians."""
-
-    scene: str
-    work: Work
-    stage_ms: dict[str, float]  # kernels
-    num_kernels: dict[str, int]  # launches of each stage
-    wall_ms: float  # a whole iteration without a clock
-
-    @property
-    def kernel_ms(self) -> float:
-        """Time in kernels, ms."""
-        return sum(self.stage_ms.values())
-
-    @property
-    def rest_ms(self) -> float:
-        """The time in no kernel."""
-        return self.wall_ms - self.kernel_ms
-
-
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.show_examples("%(prog)s --trained out/lego/point_cloud.ply")
-    add_out(parser, run, "speed.csv", "speed.json", "speed.png", "stages.png")
+    add_out(parser, run, "speed.csv", "speed.png")
     parser.add_argument("--quick", action="store_true", help="10,000 Gaussians only; two minutes")
     parser.add_argument(
         "--without-avx512",
@@ -94,49 +68,43 @@ def add_arguments(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure all scenes; write tables, CSV, JSON and plots."""
+    """Measure all scenes; write tables, CSV and a plot."""
     mi.set_variant("llvm_ad_rgb")
     if args.without_avx512:
         disable_avx512()
-    where = f"{machine()}, without AVX-512" if args.without_avx512 else machine()
-    print(where)
-    rounds = QUICK_ROUNDS if args.quick else ROUNDS
+    print(machine() + (", without AVX-512" if args.without_avx512 else ""))
     timings: list[Timing] = []
-    reports: list[IterationReport] = []
-    for scene in make_scenes(args.trained, args.quick):
-        found, report = measure_scene(scene, rounds), profile_training(scene, rounds)
-        timings += found
-        reports.append(report)
-        work = report.work
-        print(
-            f"\n{scene.name}: {work.entries:,} (Gaussian, tile) entries, {work.evaluated:,} "
-            f"(pixel, Gaussian) pairs evaluated, {work.useful:,} of them useful"
-        )
-        print(f"\n{comparison_table(found)}\n\n{stage_table(report)}", flush=True)
+    for problem in make_problems(args.trained, args.quick):
+        measured = measure(problem, QUICK_ROUNDS if args.quick else ROUNDS)
+        timings += measured
+        print(f"\n{problem.scene}\n\n{comparison_table(measured)}", flush=True)
     write_rows(args.out / "speed.csv", Timing, timings)
-    values = {
-        "machine": where,
-        "timings": [vars(timing) for timing in timings],
-        "iterations": [asdict(report) for report in reports],
-    }
-    with atomic_path(args.out / "speed.json") as temporary:
-        temporary.write_text(json.dumps(values, indent=2) + "\n")
     *_, largest = (timing.scene for timing in timings if "trained" not in timing.scene)
     write_figure(args.out / "speed.png", plot([t for t in timings if t.scene == largest]))
-    write_figure(args.out / "stages.png", plot_stages(reports))
 
 
-def make_scenes(trained: Path, quick: bool) -> list[Scene]:
+@dataclass(frozen=True)
+class Problem:
+    """A scene, the input of every implementation."""
+
+    scene: str
+    gaussians: Gaussians  # numpy
+    camera: reference.Camera
+    weights: np.ndarray  # (H, W, 3): the loss is sum(weights * image) / (H W)
+
+
+def make_problems(trained: Path, quick: bool) -> list[Problem]:
     """Return the bench scene at one or two sizes, and the trained one if it exists."""
-    camera = bench_camera(IMAGE_SIZE_PX)
     counts = (10_000,) if quick else (10_000, 100_000)
-    scenes = [Scene(f"bench scene, {n:,}", bench_gaussians(n), camera) for n in counts]
+    scenes = {f"bench scene, {n:,}": bench_gaussians(n) for n in counts}
     if trained.exists():
         gaussians = Gaussians.load(trained)
-        scenes.append(Scene(f"trained, {gaussians.num_gaussians:,}", gaussians, camera))
+        scenes[f"trained, {gaussians.num_gaussians:,}"] = gaussians
     else:
         print(f"{trained}: not there; fit a scene, or name one with --trained, to measure it")
-    return scenes
+    camera = bench_camera(IMAGE_SIZE_PX)
+    weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))
+    return [Problem(name, gaussians, camera, weights) for name, gaussians in scenes.items()]
 
 
 @dataclass(frozen=True)
@@ -146,28 +114,18 @@ class TimedRenderer:
     name: str
     forward: Callable[[], None]
     forward_backward: Callable[[], None]  # d sum(weights * image) / pixels by all parameters
-    seconds: float  # estimate, for both
-
-
-@dataclass(frozen=True)
-class Problem:
-    """The input of every implementation."""
-
-    gaussians: Gaussians  # numpy
-    camera: reference.Camera
-    weights: np.ndarray  # (H, W, 3): the loss is sum(weights * image) / (H W)
 
 
 def drgs_renderer(problem: Problem) -> TimedRenderer:
     """Return the ``splats`` integrator, called by ``mi.render``."""
     scene = make_scene(problem.gaussians, ModelConfig().with_3dgs_defaults(), (1.0, 1.0, 1.0))
-    return _mitsuba_renderer("drgs", scene, problem, "integrator.", 0.1)
+    return _mitsuba_renderer("drgs", scene, problem, "integrator.")
 
 
-def volprim_renderer(problem: Problem, shape: str, seconds: float) -> TimedRenderer:
+def volprim_renderer(problem: Problem, shape: str) -> TimedRenderer:
     """Return Mitsuba's ``volprim_rf_basic`` on ``ellipsoids`` or ``ellipsoidsmesh``."""
     scene = mi.load_dict(volprim_scene(problem.gaussians, shape, 256))
-    return _mitsuba_renderer(f"volprim_rf_basic, {shape}", scene, problem, "shapes.", seconds)
+    return _mitsuba_renderer(f"volprim_rf_basic, {shape}", scene, problem, "shapes.")
 
 
 def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str, object]:
@@ -190,9 +148,7 @@ def volprim_scene(gaussians: Gaussians, shape: str, max_depth: int) -> dict[str,
     }
 
 
-def _mitsuba_renderer(
-    name: str, scene: mi.Scene, problem: Problem, prefix: str, seconds: float
-) -> TimedRenderer:
+def _mitsuba_renderer(name: str, scene: mi.Scene, problem: Problem, prefix: str) -> TimedRenderer:
     camera = problem.camera
     sensor = mi.load_dict(mitsuba_sensor(camera) | {"near_clip": 1e-3})
     params = mi.traverse(scene)
@@ -219,7 +175,7 @@ def _mitsuba_renderer(
         dr.sync_thread()
         dr.disable_grad(values)
 
-    return TimedRenderer(name, forward, forward_backward, seconds)
+    return TimedRenderer(name, forward, forward_backward)
 
 
 def reference_renderer(problem: Problem) -> TimedRenderer:
@@ -235,65 +191,23 @@ def reference_renderer(problem: Problem) -> TimedRenderer:
         reference.render(gaussians, problem.camera, white)
         reference.render_gradients(gaussians, problem.camera, white, d_image)
 
-    seconds = 6e-4 * len(gaussians.means)
-    return TimedRenderer("numpy reference, float64", forward, forward_backward, seconds)
+    return TimedRenderer("numpy reference, float64", forward, forward_backward)
 
 
-def measure_scene(scene: Scene, rounds: int) -> list[Timing]:
+def measure(problem: Problem, rounds: int) -> list[Timing]:
     """Time all implementations, interleaved."""
-    rng = np.random.default_rng(0)
-    weights = rng.normal(size=(scene.camera.height, scene.camera.width, 3))
-    problem = Problem(scene.gaussians, scene.camera, weights)
-    count = scene.gaussians.num_gaussians
     renderers = [
         drgs_renderer(problem),
-        volprim_renderer(problem, "ellipsoids", 7e-5 * count),
-        volprim_renderer(problem, "ellipsoidsmesh", 1.5e-4 * count),
+        volprim_renderer(problem, "ellipsoids"),
+        volprim_renderer(problem, "ellipsoidsmesh"),
         reference_renderer(problem),
     ]
-    times: dict[str, list[tuple[float, float]]] = {r.name: [] for r in renderers}
-    for renderer in renderers:  # compiles the kernels
-        if renderer.seconds < VERY_SLOW_S:
-            renderer.forward_backward()
-            renderer.forward()
-    num_rounds = {
-        r.name: 1 if r.seconds > VERY_SLOW_S else SLOW_ROUNDS if r.seconds > SLOW_S else rounds
-        for r in renderers
-    }
-    for turn in range(rounds):
-        for renderer in renderers:
-            if turn < num_rounds[renderer.name]:
-                times[renderer.name].append(
-                    (seconds(renderer.forward), seconds(renderer.forward_backward))
-                )
-    return [
-        Timing(
-            scene.name,
-            name,
-            statistics.median(forward for forward, _ in pairs),
-            statistics.median(both for _, both in pairs),
-            len(pairs),
-        )
-        for name, pairs in times.items()
-    ]
-
-
-def profile_training(scene: Scene, rounds: int) -> IterationReport:
-    """Profile training on one view of the scene with all SH degrees and a fixed population.
-
-    Each round times four iterations without a clock, and one by stage.
-    """
-    trainer, walls, clocks = warm_trainer(scene), [], []
-    for _ in range(rounds):
-        walls.append(seconds(lambda: steps(trainer, 4)) / 4)
-        clocks.append(clocked_step(trainer))
-    return IterationReport(
-        scene=scene.name,
-        work=count_work(frame_of(scene)),
-        stage_ms={s: statistics.median(c.kernel_ms.get(s, 0.0) for c in clocks) for s in STAGES},
-        num_kernels={s: clocks[-1].num_kernels(s) for s in STAGES},
-        wall_ms=1e3 * statistics.median(walls),
-    )
+    times = time_in_turns([(each.forward, each.forward_backward) for each in renderers], rounds)
+    timings = []
+    for renderer, spent in zip(renderers, times, strict=True):
+        forward, both = np.median(spent, axis=0).tolist()
+        timings.append(Timing(problem.scene, renderer.name, forward, both, len(spent)))
+    return timings
 
 
 def comparison_table(timings: list[Timing]) -> str:
@@ -311,17 +225,6 @@ def comparison_table(timings: list[Timing]) -> str:
 
 def _milliseconds(duration: float) -> str:
     return f"{1e3 * duration:.1f} ms" if duration < 1 else f"{duration:.2f} s"
-
-
-def stage_table(report: IterationReport) -> str:
-    """Format the stages of a training iteration."""
-    rows: list[list[object]] = [
-        [s, f"{report.stage_ms[s]:.1f} ms", f"{report.num_kernels[s]}"] for s in STAGES
-    ]
-    rows.append(["rest of wall time", f"{report.rest_ms:.1f} ms", ""])
-    total = sum(report.num_kernels.values())
-    rows.append(["a training iteration", f"{report.wall_ms:.1f} ms", total])
-    return markdown_table(["stage", "time", "kernels"], rows)
 
 
 def plot(timings: list[Timing]) -> Figure:
@@ -345,21 +248,4 @@ def plot(timings: list[Timing]) -> Figure:
     axes.set(xticks=[], xlim=(0, 1.3 * max(shown.values())))
     axes.invert_yaxis()
     axes.spines[:].set_visible(False)
-    return figure
-
-
-def plot_stages(reports: list[IterationReport]) -> Figure:
-    """Draw the stages of a training iteration, for each scene."""
-    figure = new_figure(7.6, 4)
-    axes = figure.subplots()
-    labels = [report.scene.replace(", ", "\n") for report in reports]
-    bottoms = np.zeros(len(reports))
-    for stage in STAGES:
-        values = np.array([report.stage_ms[stage] for report in reports])
-        axes.bar(labels, values, bottom=bottoms, label=stage)
-        bottoms += values
-    rest = [max(report.rest_ms, 0) for report in reports]
-    axes.bar(labels, rest, bottom=bottoms, label="rest of wall time", color="0.8")
-    axes.set(ylabel="ms", title="a training iteration")
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1))
     return figure

@@ -27,7 +27,6 @@ from drgs.cli.commands import (
 )
 from drgs.cli.execution import add_variant_argument, select_variant
 from drgs.core.errors import UserError
-from drgs.core.files import refusal_reason
 from drgs.core.folders import sole_writer
 from drgs.core.memory import too_large_reason
 
@@ -121,18 +120,6 @@ def _add_cameras(parser: CommandParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Capture the scene that the command line names."""
-    try:
-        _capture(args)
-    except BrokenPipeError:  # of the output, whose reader has gone
-        raise
-    except OSError as error:
-        raise UserError(f"{error.filename or args.out}: {refusal_reason(error)}") from None
-    except KeyboardInterrupt:
-        print("\nthe same command continues", file=sys.stderr)
-        raise
-
-
-def _capture(args: argparse.Namespace) -> None:
     given = _given_settings(args)
     settings = replace(CaptureSettings(), **given)
     if reason := too_large_reason(*settings.size):
@@ -149,8 +136,12 @@ def _capture(args: argparse.Namespace) -> None:
         folder = CaptureFolder(args.out, args.scene, settings, keep)
         folder.check()
         print(_describe_cameras(settings, len(views)))
-        folder.take_images(scene, views)
-        folder.write_dataset(scene, views)
+        try:
+            folder.take_images(scene, views)
+            folder.write_dataset(scene, views)
+        except KeyboardInterrupt:
+            print("\nthe same command continues", file=sys.stderr)
+            raise
 
 
 def _given_settings(args: argparse.Namespace) -> dict[str, object]:
@@ -164,12 +155,12 @@ def _given_settings(args: argparse.Namespace) -> dict[str, object]:
 def _describe_cameras(settings: CaptureSettings, count: int) -> str:
     if settings.cameras == "sensors":
         return f"cameras: the scene's own sensors, {count}"
-    place = "around the scene"
+    where = "around the scene"
     if settings.cameras == "inside":
         assert settings.target is not None, "settings_for sets it"
         target = ", ".join(f"{value:.4g}" for value in settings.target)
-        place = f"inside the scene, around ({target})"
-    return f"cameras: {count} {place}, field of view {math.degrees(settings.fov):.4g} degrees"
+        where = f"inside the scene, around ({target})"
+    return f"cameras: {count} {where}, field of view {math.degrees(settings.fov):.4g} degrees"
 
 
 if __name__ == "__main__":

@@ -76,7 +76,7 @@ class SceneSensor(NamedTuple):
 
 def perspective_sensors(scene: mi.Scene) -> list[SceneSensor]:
     """Return the scene's sensors of the types ``perspective`` and ``thinlens``."""
-    found = []
+    sensors = []
     for sensor in scene.sensors():
         parameters = mi.traverse(sensor)
         if "x_fov" not in parameters:
@@ -86,8 +86,8 @@ def perspective_sensors(scene: mi.Scene) -> list[SceneSensor]:
         width, height = sensor.film().size()
         fov = math.radians(cast("Float", parameters["x_fov"])[0])
         fov = scale_fov(fov, min(1.0, height / width))
-        found.append(SceneSensor(pose @ OPENGL_TO_MITSUBA, fov))
-    return found
+        sensors.append(SceneSensor(pose @ OPENGL_TO_MITSUBA, fov))
+    return sensors
 
 
 def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) -> CaptureSettings:
@@ -95,22 +95,22 @@ def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) ->
 
     Raises :class:`UserError` for a setting that the cameras do not use.
     """
-    own = perspective_sensors(scene)
+    sensors = perspective_sensors(scene)
     if "cameras" not in given:
-        kind = _kind_for(scene, settings, given, own)
+        kind = _kind_for(scene, settings, given, sensors)
         return settings_for(scene, replace(settings, cameras=kind), {*given, "cameras"})
     for name in sorted(given & UNUSED[settings.cameras]):
         option = f"--{name.replace('_', '-')}"
         raise UserError(f"{option}: is not used with --cameras {settings.cameras}; leave it out")
     if settings.cameras == "sensors":
-        derived = _sensor_settings(own)
+        derived = _sensor_settings(sensors)
     elif settings.cameras == "inside":
         spot, _ = _room(scene, settings)
         derived = {"target": tuple(spot.tolist()), "fov": _fov(settings, INSIDE_FOV)}
     else:
-        derived = _around_settings(scene, settings, given, own) if own else {}
-    if own and settings.cameras != "sensors":
-        derived["up"] = _up_axis(own)
+        derived = _around_settings(scene, settings, given, sensors) if sensors else {}
+    if sensors and settings.cameras != "sensors":
+        derived["up"] = _up_axis(sensors)
     return replace(settings, **{name: derived[name] for name in derived.keys() - given})
 
 
@@ -127,17 +127,17 @@ def views_of(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
 
 
 def _kind_for(
-    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[SceneSensor]
+    scene: mi.Scene, settings: CaptureSettings, given: Set[str], sensors: list[SceneSensor]
 ) -> str:
     if given & ORBITING:
         return "around"
-    if len(own) >= ENOUGH_SENSORS and not given & {*COUNTS, "target", "up", "fov"}:
+    if len(sensors) >= ENOUGH_SENSORS and not given & {*COUNTS, "target", "up", "fov"}:
         return "sensors"
     _, is_closed = _room(scene, settings)
     if not is_closed:
         return "around"
     author_is_inside = any(
-        _measure_enclosure(scene, [o.pose[:3, 3] for o in own])[0] >= MIN_ENCLOSED_SHARE
+        _measure_enclosure(scene, [o.pose[:3, 3] for o in sensors])[0] >= MIN_ENCLOSED_SHARE
     )
     if not author_is_inside and _is_lit(scene, replace(settings, cameras="around"), given):
         return "around"
@@ -155,33 +155,33 @@ def _is_lit(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) -> bool
 
 
 def _around_settings(
-    scene: mi.Scene, settings: CaptureSettings, given: Set[str], own: list[SceneSensor]
+    scene: mi.Scene, settings: CaptureSettings, given: Set[str], sensors: list[SceneSensor]
 ) -> dict[str, object]:
     """Return settings for the view of the scene's sensors, if they look at its middle."""
     middle = np.mean(bounding_box(scene), axis=0, dtype=np.float64)
-    ahead = [(o.pose[:3, 3], -o.pose[:3, 2]) for o in own]
-    seen = [c + ((middle - c) @ axis) * axis for c, axis in ahead if (middle - c) @ axis > 0]
-    if not seen or given & {"fov", "distance"}:
+    ahead = [(o.pose[:3, 3], -o.pose[:3, 2]) for o in sensors]
+    aims = [c + ((middle - c) @ axis) * axis for c, axis in ahead if (middle - c) @ axis > 0]
+    if not aims or given & {"fov", "distance"}:
         return {}
-    target = np.mean(seen, axis=0) if settings.target is None else np.array(settings.target)
-    distance = float(np.median([np.linalg.norm(o.pose[:3, 3] - target) for o in own]))
-    fov = _fov(settings, float(np.median([o.narrower_fov for o in own])))
+    target = np.mean(aims, axis=0) if settings.target is None else np.array(settings.target)
+    distance = float(np.median([np.linalg.norm(o.pose[:3, 3] - target) for o in sensors]))
+    fov = _fov(settings, float(np.median([o.narrower_fov for o in sensors])))
     return {"target": tuple(target.tolist()), "distance": distance, "fov": fov}
 
 
-def _sensor_settings(own: list[SceneSensor]) -> dict[str, object]:
-    if not own:
+def _sensor_settings(sensors: list[SceneSensor]) -> dict[str, object]:
+    if not sensors:
         raise UserError(
             "--cameras sensors: the scene has no sensor of type perspective or thinlens; leave the "
             "option out"
         )
-    tests = len(own[::TEST_EVERY]) if len(own) > 1 else 0
-    return {"views": len(own) - tests, "val_views": 0, "test_views": tests}
+    tests = len(sensors[::TEST_EVERY]) if len(sensors) > 1 else 0
+    return {"views": len(sensors) - tests, "val_views": 0, "test_views": tests}
 
 
-def _up_axis(own: list[SceneSensor]) -> str:
+def _up_axis(sensors: list[SceneSensor]) -> str:
     """Return the axis that is nearest to up in the sensors' images, such as ``z`` or ``-y``."""
-    up = np.mean([o.pose[:3, 1] for o in own], axis=0)
+    up = np.mean([o.pose[:3, 1] for o in sensors], axis=0)
     axis = int(np.argmax(np.abs(up)))
     return f"{'-' if up[axis] < 0 else ''}{'xyz'[axis]}"
 
@@ -286,11 +286,11 @@ def views_inside(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView
     return _views(settings, target, distances)
 
 
-def views_of_sensors(own: list[SceneSensor], settings: CaptureSettings) -> list[CaptureView]:
+def views_of_sensors(sensors: list[SceneSensor], settings: CaptureSettings) -> list[CaptureView]:
     """Return the views of the scene's own sensors."""
     has_tests = settings.test_views > 0
-    tests = own[::TEST_EVERY] if has_tests else []
-    train = [o for n, o in enumerate(own) if not (has_tests and n % TEST_EVERY == 0)]
+    tests = sensors[::TEST_EVERY] if has_tests else []
+    train = [o for n, o in enumerate(sensors) if not (has_tests and n % TEST_EVERY == 0)]
     return [
         CaptureView(split, index, o.pose, _fov(settings, o.narrower_fov))
         for split, cameras in (("train", train), ("test", tests))

@@ -83,13 +83,13 @@ class CaptureFolder:
             )
         text = read_text(path, "settings of the capture", MAX_MANIFEST_BYTES)
         try:
-            found = json.loads(text)
+            recorded = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise UserError(f"{path}: not valid JSON: {one_line(error)}; {remedy}") from None
-        found = found if isinstance(found, dict) else {}
+        recorded = recorded if isinstance(recorded, dict) else {}
         for key, value in json.loads(json.dumps(self._manifest)).items():
-            if found.get(key) != value:
-                theirs, ours = (_value_text(key, each) for each in (found.get(key), value))
+            if recorded.get(key) != value:
+                theirs, ours = (_value_text(key, each) for each in (recorded.get(key), value))
                 raise UserError(
                     f"{path}: the folder holds another capture: {key} is {theirs}, requested is "
                     f"{ours}; {remedy}"

@@ -192,13 +192,13 @@ def refuse_splats(path: Path, scene: mi.Scene) -> None:
     integrator = scene.integrator()
     nested = [] if integrator is None else mi.traverse(integrator).hierarchy  # itself included
     if any(map(is_splats, nested)):
-        found = "its integrator is splats"
+        evidence = "its integrator is splats"
     elif any("Ellipsoids" in node.class_name() for node in mi.traverse(scene).hierarchy):
-        found = "it has shapes of type ellipsoids"
+        evidence = "it has shapes of type ellipsoids"
     else:
         return
     raise UserError(
-        f"{path}: the scene holds splats ({found}), which path tracing leaves out; take images "
+        f"{path}: the scene holds splats ({evidence}), which path tracing leaves out; take images "
         f"of it with python -m drgs.render {path} --out DIR, or remove the splats from the file"
     )
 

@@ -96,9 +96,9 @@ class CommandParser(argparse.ArgumentParser):
     @override
     def error(self, message: str) -> NoReturn:
         """Raise :class:`UserError`; an option of several words is shown with them."""
-        found = re.fullmatch(r"argument (?:\S+/)?(--\S+): expected \d+ arguments", message)
-        if found and isinstance(metavar := self._option_string_actions[found[1]].metavar, tuple):
-            message = f"{message}: {found[1]} {' '.join(metavar)}"
+        match = re.fullmatch(r"argument (?:\S+/)?(--\S+): expected \d+ arguments", message)
+        if match and isinstance(metavar := self._option_string_actions[match[1]].metavar, tuple):
+            message = f"{message}: {match[1]} {' '.join(metavar)}"
         raise UserError(f"{one_line(message, 500)}; see {self.prog} --help")
 
 

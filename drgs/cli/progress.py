@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from typing import TextIO
 
 from rich.console import Console
@@ -80,17 +79,27 @@ class RunProgress:
         return f"left {seconds // 60}:{seconds % 60:02d}"
 
 
-@contextmanager
-def show_examination() -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of an examination on the terminal, within the block."""
-    with ExitStack() as bars:
-        shown: dict[str, RunProgress] = {}
+class StepProgress:
+    """Progress of several steps, one after the other, each with a bar of its own.
 
-        def show(what: str, done: int, total: int) -> None:
-            if what not in shown:
-                shown[what] = bars.enter_context(RunProgress(f"examines {what}:", total))
-            shown[what].update(done, total)
-            if done == total:
-                bars.close()
+    A context manager. prefix: before the names of steps.
+    """
 
-        yield show
+    def __init__(self, prefix: str = "") -> None:
+        self._prefix, self._stack, self._step, self._most = prefix, ExitStack(), "", 0
+
+    def __enter__(self) -> StepProgress:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
+
+    def update(self, step: str, done: int, total: int) -> None:
+        """Show ``done`` of ``total`` in ``step``; less than before is not shown."""
+        if step != self._step:
+            self._stack.close()
+            self._step, self._most = step, -1
+            self._shown = self._stack.enter_context(RunProgress(f"{self._prefix}{step}", total))
+        if done > self._most:
+            self._most = done
+            self._shown.update(done, total)

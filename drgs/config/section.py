@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Optional, TypeVar, cast, get_args
 
@@ -22,7 +24,7 @@ from pydantic_core.core_schema import ErrorType
 from typing_extensions import LiteralString, Self
 
 from drgs.core.constants import MAX_INT
-from drgs.core.errors import did_you_mean, one_line
+from drgs.core.errors import UserError, did_you_mean, one_line
 from drgs.core.registry import HOW_TO_INSTALL, Extension, Registry, shipped_modules
 
 if TYPE_CHECKING:
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 Count = Annotated[int, Field(le=MAX_INT)]
 
 T = TypeVar("T")
+Model = TypeVar("Model", bound=BaseModel)
 
 if TYPE_CHECKING:
     Resolved = Annotated[T, "null before"]
@@ -199,7 +202,40 @@ def expectation(error: ErrorDetails) -> str:
             return f"must be {sign} {context[relation]:.10g}"
     if kind == "literal_error":
         return f"must be one of {context['expected']}"
-    return f"must be {_EXPECTED.get(kind.split('_')[0], error['msg'])}"
+    known = _EXPECTED.get(kind.split("_")[0])
+    if known is None or kind in ("string_pattern_mismatch", "too_short"):
+        return re.sub(r"^\w+ should", "must", error["msg"])
+    return f"must be {known}"
+
+
+def validate(kind: type[Model], content: object, where: str) -> Model:
+    """Return a part of a file; where: start of messages, followed by keys.
+
+    Raises :class:`UserError` naming the key, the expectation and the value.
+    """
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        raise UserError(f"{where}{explain_error(error.errors()[0])}") from None
+
+
+def parse_json(text: str | bytes, where: str) -> Any:
+    """Return the content of JSON; where: start of messages. Raises :class:`UserError`."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{where}not valid JSON: {one_line(error)}") from None
+
+
+def explain_error(error: ErrorDetails) -> str:
+    """Return key, expectation and value of one of pydantic's errors on the content of a file."""
+    parts = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]]
+    key = one_line("".join(parts).removeprefix("."), 200)
+    if error["type"] == "missing":
+        return f"{key} is missing"
+    expected = "must be an object" if error["type"] == "model_type" else expectation(error)
+    got = one_line(json.dumps(error["input"]), 60)
+    return f"{key or 'the content'} {one_line(expected, 200)}, got {got}"
 
 
 def format_value(value: object) -> str:

@@ -109,25 +109,34 @@ def read_text(path: Path, what: str, max_bytes: int, memory_ratio: int = 2) -> s
         ) from None
 
 
+@contextmanager
+def refuse_damage(where: str) -> Iterator[None]:
+    """Turn all errors of a block into the user's: libraries raise many types for a broken file.
+
+    where: start of the message, such as ``a.png: cannot read the image``.
+    """
+    try:
+        yield
+    except (UserError, MemoryError):
+        raise
+    except Exception as error:
+        reason = getattr(error, "strerror", None) or one_line(error, 200) or type(error).__name__
+        raise UserError(f"{where}: {reason}") from None
+
+
 def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
     """Return the arrays of an ``.npz`` file of ``np.savez``; see :func:`read_bytes`."""
     import numpy as np  # a list of commands needs none
 
-    with open_regular(path, what) as file:
-        try:
-            size = os.fstat(file.fileno()).st_size
-            with zipfile.ZipFile(file) as archive:
-                if sum(part.file_size for part in archive.infolist()) > size:
-                    raise ValueError("its arrays are larger than the file")
-            file.seek(0)
-            require_memory(path, size, f"the {what}")
-            with np.load(file, allow_pickle=False) as arrays:
-                return {name: arrays[name] for name in arrays.files}
-        except UserError:
-            raise
-        except Exception as error:  # zipfile and NumPy raise many types for a broken file
-            reason = one_line(error) or type(error).__name__
-            raise UserError(f"{path}: cannot read the {what}: {reason}") from None
+    with open_regular(path, what) as file, refuse_damage(f"{path}: cannot read the {what}"):
+        size = os.fstat(file.fileno()).st_size
+        with zipfile.ZipFile(file) as archive:
+            if sum(part.file_size for part in archive.infolist()) > size:
+                raise ValueError("its arrays are larger than the file")
+        file.seek(0)
+        require_memory(path, size, f"the {what}")
+        with np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
 
 
 _TEMPORARY_NAME = re.compile(r"\.(.*)\.(\d{1,9})\.tmp(\.[^.]*)?")
@@ -174,8 +183,8 @@ def remove_temporaries_of(folder: Path, names: Iterable[str]) -> None:
     """Remove temporary files in ``folder`` for the files ``names``, unless their writers run."""
     wanted = {(shorten_stem(path.stem), path.suffix) for path in map(Path, names)}
     for path in folder.glob(".*.tmp*"):
-        found = _TEMPORARY_NAME.fullmatch(path.name)
-        if found and (found[1], found[3] or "") in wanted and not psutil.pid_exists(int(found[2])):
+        match = _TEMPORARY_NAME.fullmatch(path.name)
+        if match and (match[1], match[3] or "") in wanted and not psutil.pid_exists(int(match[2])):
             with suppress(OSError):
                 path.unlink()
 

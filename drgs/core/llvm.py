@@ -16,14 +16,16 @@ import os
 import platform
 import re
 import sys
-import warnings
 from contextlib import suppress
 from glob import glob
 from pathlib import Path
 
 MINIMUM_VERSION = 17  # first major version that compiles every kernel
 
-TESTED_VERSION = 19  # first major version that drgs is tested with; earlier ones give a warning
+HOW_TO_INSTALL = (
+    "Install one with pip install 'drgs[llvm]' (x86-64 Linux), apt-get install libllvm19 or brew "
+    "install llvm"
+)
 
 ENVIRONMENT_FOLDER = os.path.join(sys.prefix, "lib")  # of libraries that pip and conda install
 
@@ -40,10 +42,9 @@ class LLVMVersionError(ImportError, RuntimeError):
 
 
 def select_newest_llvm() -> None:
-    """Set ``DRJIT_LIBLLVM_PATH`` to the best usable libLLVM, for this process and its children.
+    """Set ``DRJIT_LIBLLVM_PATH`` to the newest libLLVM, for this process and its children.
 
-    A tested version of the system comes first, then that of the Python environment. Without effect
-    if the variable is set, Dr.Jit is imported, or no usable library is found.
+    Without effect if the variable is set, Dr.Jit is imported, or no usable library is found.
     """
     if os.environ.get(PATH_VARIABLE) or "drjit" in sys.modules:
         return
@@ -54,16 +55,10 @@ def select_newest_llvm() -> None:
 
 
 def ensure_usable_llvm() -> None:
-    """Raise :class:`LLVMVersionError` unless Dr.Jit's libLLVM is recent enough; warn if old."""
+    """Raise :class:`LLVMVersionError` unless Dr.Jit's libLLVM is recent enough."""
     version = loaded_version()
     if version is None or version[0] < MINIMUM_VERSION:
         raise LLVMVersionError(_refusal(version))
-    if version[0] < TESTED_VERSION:
-        warnings.warn(
-            f"drgs: libLLVM {format_version(version)} is untested; {TESTED_VERSION} or newer is "
-            f"recommended: {_install_commands()}",
-            stacklevel=2,
-        )
 
 
 def check_llvm_variants() -> None:
@@ -84,24 +79,18 @@ def loaded_version() -> Version | None:
 
 
 def installed_libraries() -> list[tuple[Version, str]]:
-    """Return (version, path) of every libLLVM in the usual places, the best first.
+    """Return (version, path) of every libLLVM in the usual places, the newest first.
 
-    Tested versions come before others, the system's before the environment's, newer before older.
     Versions come from file names: loading is slow, and two libLLVM in one process conflict.
     """
-    found = set()
+    libraries = set()
     for folder in _library_folders():
         for name in glob(os.path.join(folder, "libLLVM*")):
             version = version_from_name(name)
             if version is not None and os.path.isfile(name):
-                found.add((version, name))
+                libraries.add((version, name))
 
-    def rank(item: tuple[Version, str]) -> tuple:
-        (major, *_), path = item
-        is_of_system = not path.startswith(ENVIRONMENT_FOLDER)
-        return major >= TESTED_VERSION, is_of_system, item[0], len(path)
-
-    return sorted(found, key=rank, reverse=True)
+    return sorted(libraries, key=lambda item: (item[0], len(item[1])), reverse=True)
 
 
 def library_file() -> str | None:
@@ -160,27 +149,18 @@ def _library_folders() -> list[str]:
 
 
 def _refusal(version: Version | None) -> str:
-    found = "none that Dr.Jit can load" if version is None else format_version(version)
+    loaded = "none that Dr.Jit can load" if version is None else format_version(version)
     if version is None and (named := os.environ.get(PATH_VARIABLE)):
-        found += f" ({PATH_VARIABLE}={named})"
+        loaded += f" ({PATH_VARIABLE}={named})"
     message = (
-        f"drgs: libLLVM {MINIMUM_VERSION} or newer is needed ({TESTED_VERSION} is tested), found "
-        f"{found}. Install one with {_install_commands()}, or name its file in the environment "
-        f"variable {PATH_VARIABLE}"
+        f"drgs: libLLVM {MINIMUM_VERSION} or newer is needed, found {loaded}. {HOW_TO_INSTALL}, or "
+        f"name its file in the environment variable {PATH_VARIABLE}"
     )
     usable = [path for version, path in installed_libraries() if version[0] >= MINIMUM_VERSION]
     if usable:
         message += f"; here {PATH_VARIABLE}={usable[0]} would do"
         message += ", or 'import drgs' before drjit and mitsuba"
     return message + "."
-
-
-def _install_commands() -> str:
-    if sys.platform == "darwin":
-        return "'brew install llvm'"
-    system = f"'apt-get install libllvm{TESTED_VERSION}'"
-    has_wheel = sys.platform == "linux" and platform.machine() == "x86_64"
-    return f"\"pip install 'drgs[llvm]'\" or {system}" if has_wheel else system
 
 
 def format_version(version: Version) -> str:

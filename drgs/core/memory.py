@@ -28,12 +28,12 @@ IMAGE_BYTES = (
 SAMPLE_BYTES = 80  # a further sample of a pixel: planes
 CHANNEL_BYTES = 24  # a channel besides colour: plane, block, image, copy
 
-UNASKED_FILE_BYTES = 1 << 24  # read without a check: a fit reads hundreds of photographs
-UNASKED_BYTES = 1 << 28  # rendered without a check, which may take a millisecond
+UNCHECKED_FILE_BYTES = 1 << 24  # read without a check: a fit reads hundreds of photographs
+UNCHECKED_BYTES = 1 << 28  # rendered without a check, which may take a millisecond
 
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
-_UNLIMITED_BYTES = 1 << 60  # below what version 1 of control groups has for no limit
+_UNLIMITED_BYTES = 1 << 60
 
 
 def available_memory() -> int:
@@ -66,7 +66,7 @@ def format_bytes(count: float) -> str:
 
 def require_memory(path: str | Path, needed: int, what: str) -> None:
     """Raise :class:`UserError` unless ``needed`` bytes are available for a file's content."""
-    available = _check_available(needed, UNASKED_FILE_BYTES)
+    available = _check_available(needed, UNCHECKED_FILE_BYTES)
     if available is not None:
         raise UserError(
             f"{path}: {what} takes about {format_bytes(needed)} of memory, of which "
@@ -74,12 +74,12 @@ def require_memory(path: str | Path, needed: int, what: str) -> None:
         )
 
 
-def _check_available(needed: int, unasked: int) -> int | None:
+def _check_available(needed: int, unchecked: int) -> int | None:
     """Return the available bytes if they are fewer than ``needed``, else None.
 
-    unasked: bytes that are granted without a check. Dr.Jit's cache counts as available.
+    unchecked: bytes that are granted without a check. Dr.Jit's cache counts as available.
     """
-    if needed <= unasked or needed <= available_memory():
+    if needed <= unchecked or needed <= available_memory():
         return None
     _flush_cache_of_drjit()
     available = available_memory()
@@ -114,7 +114,7 @@ def too_large_reason(width: int, height: int, channels: int = 3, samples: int = 
         )
     of_channels = CHANNEL_BYTES * (channels - 3)
     of_pixel = IMAGE_BYTES + SAMPLE_BYTES * (samples - 1) + of_channels
-    available = _check_available(pixels * of_pixel, UNASKED_BYTES)
+    available = _check_available(pixels * of_pixel, UNCHECKED_BYTES)
     if available is None:
         return None
     return (
@@ -137,30 +137,24 @@ def _process_limit() -> int:
 
 
 def _control_group_limit() -> int:
-    """Return the bytes that the process's control groups leave; versions 1 and 2."""
+    """Return the bytes that the process's control group (version 2) and its parents leave."""
     rooms = [_UNLIMITED_BYTES]
     for line in _lines(_PROC / "self" / "cgroup"):
         _, controllers, path = line.split(":", 2)
-        if not controllers:
-            names, root = ("memory.max", "memory.current", "inactive_file"), _CGROUPS
-        elif "memory" in controllers.split(","):
-            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
-            root = _CGROUPS / "memory"
-        else:
-            continue
-        group = root / path.strip("/")
-        # In a container, its own group is mounted as the root.
-        rooms += [_group_limit(folder, *names) for folder in (group, *group.parents, root)]
+        if not controllers:  # of version 2
+            group = _CGROUPS / path.strip("/")
+            # In a container, its own group is mounted as the root.
+            rooms += [_group_limit(folder) for folder in (group, *group.parents, _CGROUPS)]
     return min(rooms)
 
 
-def _group_limit(group: Path, limit: str, usage: str, reclaimable: str) -> int:
+def _group_limit(group: Path) -> int:
     """Return the bytes that a control group has left, with its file cache."""
-    most, used = (next(iter(_lines(group / name)), "") for name in (limit, usage))
-    if not most.isdigit() or not used.isdigit() or int(most) >= _UNLIMITED_BYTES:
+    most, used = (next(iter(_lines(group / f"memory.{name}")), "") for name in ("max", "current"))
+    if not most.isdigit() or not used.isdigit():
         return _UNLIMITED_BYTES
     statistics = dict(line.split()[:2] for line in _lines(group / "memory.stat"))
-    return int(most) - int(used) + int(statistics.get(reclaimable, 0))
+    return int(most) - int(used) + int(statistics.get("inactive_file", 0))
 
 
 def _lines(path: Path) -> list[str]:

@@ -111,16 +111,16 @@ def disable_avx512() -> None:
     To be called before the first kernel. Raises :class:`UserError` if that is not possible.
     """
     llvm_version()  # waits until the backend knows its processor
-    place = "jit_llvm_set_target(): cannot leave out AVX-512"
+    where = "jit_llvm_set_target(): cannot leave out AVX-512"
     try:
         processor = _llvm_function("_Z19jit_llvm_target_cpuv", ctypes.c_char_p)()
         features = _llvm_function("_Z24jit_llvm_target_featuresv", ctypes.c_char_p)()
         set_target = _llvm_function("_Z19jit_llvm_set_targetPKcS0_j", None)
     except (AttributeError, OSError) as error:
-        raise UserError(f"{place}: this build of Dr.Jit has no such function; omit it") from error
+        raise UserError(f"{where}: this build of Dr.Jit has no such function; omit it") from error
     names = (features or b"").decode().split(",")
     if "+avx512vl" not in names:
-        raise UserError(f"{place}: Dr.Jit does not use it on this processor; omit it")
+        raise UserError(f"{where}: Dr.Jit does not use it on this processor; omit it")
     wider = ("avx512", "evex512", "avx10", "amx")
     rest = [f"-{name[1:]}" if name[1:].startswith(wider) else name for name in names]
     set_target(processor, ",".join(rest).encode(), ctypes.c_uint32(8))

@@ -57,11 +57,11 @@ class ColmapReader(DatasetReader):
         frames = []
         for image, file, mask in zip(images, files, masks, strict=True):
             values = _values(model.cameras[image.camera], image, file, mask, folder)
-            found = {"image": file}
+            paths = {"image": file}
             if mask is not None and not config.ignore_masks:
-                found["mask"] = mask
+                paths["mask"] = mask
             place = f"image {one_line(image.name, 100)}: "
-            frames.append(TransformsFrame(values, folder, place, is_as_stored=True, files=found))
+            frames.append(TransformsFrame(values, folder, place, is_as_stored=True, files=paths))
         lists = unlisted_splits((folder, root), [image.name for image in model.images], notes)
         cloud, note = model.points_file if model.has_points else None, f"; images of {below.name}"
         if cloud is not None and config.ignore_points:
@@ -109,9 +109,9 @@ def folders_in(folder: Path) -> list[Path]:
 
 def require_model(folder: Path) -> tuple[Path, Path]:
     """Return the folders of :func:`find_model`; raise :class:`UserError` where there is none."""
-    if (found := find_model(folder)) is None:
+    if (folders := find_model(folder)) is None:
         raise UserError(f"{folder}: there is no model of COLMAP in {', '.join(MODEL_FOLDERS)}")
-    return found
+    return folders
 
 
 def _images_and_files(
@@ -124,9 +124,9 @@ def _images_and_files(
     names = [image.name for image in images]
     places = [f"{folder}: image {one_line(name, 100)}" for name in names]
     below = image_folder(config, model)
-    found = find_files(below, folder, names, PHOTOGRAPHS, places, notes)
-    images = [image for image in images if image.name in found]
-    return images, [found[image.name] for image in images]
+    existing = find_files(below, folder, names, PHOTOGRAPHS, places, notes)
+    images = [image for image in images if image.name in existing]
+    return images, [existing[image.name] for image in images]
 
 
 def image_folder(config: DataConfig, model: ColmapModel) -> Path:
@@ -207,14 +207,14 @@ def _size_as_calibrated(
 ) -> tuple[int, int]:
     """Return width and height, px, of the photograph as COLMAP read it: not turned by EXIF."""
     header = read_header(file)
-    (width, height), seen = header.size, (camera.width, camera.height)
+    (width, height), calibrated = header.size, (camera.width, camera.height)
     sizes = [(width, height)]
     if header.orientation >= FIRST_TRANSPOSED_ORIENTATION:
         sizes.append((height, width))
-    if seen in sizes:
-        return seen
+    if calibrated in sizes:
+        return calibrated
     for size in sizes:
-        if is_scaled(size, seen):
+        if is_scaled(size, calibrated):
             return size
     raise UserError(
         f"{folder}: image {one_line(image.name, 100)} was {camera.width} x {camera.height} px for "

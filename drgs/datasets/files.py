@@ -93,13 +93,13 @@ def find_files(
 
     Raises :class:`UserError` where fewer than half were found, or only one of several.
     """
-    finder, found, near = _FileFinder(folder), {}, {}
+    finder, existing, near = _FileFinder(folder), {}, {}
     for name in dict.fromkeys(names):
         if path := finder.exact(name):
-            found[name] = path
+            existing[name] = path
         elif len(paths := finder.find_similar(name, kind.suffixes)) == 1:
             near[name] = paths[0]
-    counts = Counter([*found.values(), *near.values()])
+    counts = Counter([*existing.values(), *near.values()])
     near = {name: path for name, path in near.items() if counts[path] == 1}
     if near:
         (name, path), *_ = near.items()
@@ -107,8 +107,8 @@ def find_files(
             f"{source}: taken under nearly the same name: {len(near):,} {kind.plural}, such as "
             f"{one_line(path, 200)} for {one_line(name, 100)}"
         )
-    found |= near
-    missing = [index for index, name in enumerate(names) if name not in found]
+    existing |= near
+    missing = [index for index, name in enumerate(names) if name not in existing]
     if missing:
         count = f"{len(missing):,} of {len(names):,} {kind.plural}"
         enough = max(MIN_FOUND_SHARE * len(names), MIN_FOUND)
@@ -119,7 +119,7 @@ def find_files(
             )
         shown = format_names([one_line(names[index], 100) for index in missing])
         notes.append(f"{source}: not there: {count} ({shown}); {kind.consequence}")
-    return found
+    return existing
 
 
 class _FileFinder:
@@ -146,8 +146,8 @@ class _FileFinder:
             if is_elsewhere or (start > 0 and self._is_image_folder(parts[start - 1]))
         ]
         places += [] if first else [[IMAGE_FOLDERS[0], *parts]]
-        found = (self._search_below(place, suffixes) for place in places if place)
-        return next(filter(None, found), [])
+        matches = (self._search_below(place, suffixes) for place in places if place)
+        return next(filter(None, matches), [])
 
     def _is_image_folder(self, name: str) -> bool:
         return bool(_IMAGE_FOLDER.fullmatch(key_of(name))) or name == self._folder.name
@@ -156,12 +156,12 @@ class _FileFinder:
         folders = [self._folder]
         for part in parts[:-1]:
             folders = [f / name for f in folders for name in self._match_name(f, part)]
-        found = [f / name for f in folders for name in self._match_name(f, parts[-1])]
-        if not found:
+        paths = [f / name for f in folders for name in self._match_name(f, parts[-1])]
+        if not paths:
             stem = f"{stem_of(parts[-1])}.*"
-            found = [f / name for f in folders for name in self._match_name(f, stem)]
-            found = [path for path in found if path.suffix.lower() in suffixes]
-        return [path for path in found if os.path.isfile(path)]
+            paths = [f / name for f in folders for name in self._match_name(f, stem)]
+            paths = [path for path in paths if path.suffix.lower() in suffixes]
+        return [path for path in paths if os.path.isfile(path)]
 
     def _match_name(self, folder: Path, name: str) -> list[str]:
         """Return the same name, or else those that differ in case."""
@@ -246,8 +246,8 @@ def _masks_beside(images: Path, names: Sequence[str]) -> list[Path]:
     """Return files beside photographs with the name of a mask, which are no photographs."""
     photographs = {images / name for name in names}
     folders = {path.parent for path in photographs}
-    found = [path for folder in folders for path in folder.iterdir() if path not in photographs]
-    return _png_first(p for p in found if is_image(p.name) and _photograph_key(_mask_key(p.name)))
+    others = [path for folder in folders for path in folder.iterdir() if path not in photographs]
+    return _png_first(p for p in others if is_image(p.name) and _photograph_key(_mask_key(p.name)))
 
 
 def _mask_key(name: str) -> str:

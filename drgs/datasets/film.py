@@ -43,11 +43,11 @@ def to_film(view: Viewpoint, position: Columns) -> tuple[np.ndarray, np.ndarray,
     """
     if view.lens is None:
         x, y, z = position
-        seen = z > 0
-        inverse = 1 / np.where(seen, z, 1)
+        visible = z > 0
+        inverse = 1 / np.where(visible, z, 1)
         u = float(view.fx) * (x * inverse) + float(view.cx)
         v = float(view.fy) * (y * inverse) + float(view.cy)
-        return u, v, np.where(seen, z, 0)
+        return u, v, np.where(visible, z, 0)
     Float = {4: llvm.Float, 8: llvm.Float64}[position[0].itemsize]
     point = types_of(Float).Array3f(*(from_host(Float, column) for column in position))
     K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]])
@@ -55,8 +55,8 @@ def to_film(view: Viewpoint, position: Columns) -> tuple[np.ndarray, np.ndarray,
     size = view.width, view.height
     camera = Camera.create(Float, np.eye(3), np.zeros(3), K, *size, nearest)
     lens = view.lens.upload(Float)
-    seen, point, depth = lens.visibility(camera, point)
-    film, depth = lens.project_point(camera, point), dr.select(seen, depth, 0)
+    visible, point, depth = lens.visibility(camera, point)
+    film, depth = lens.project_point(camera, point), dr.select(visible, depth, 0)
     dr.eval(film, depth)
     return film.x.numpy(), film.y.numpy(), depth.numpy()
 
@@ -77,10 +77,10 @@ def shown_points(
     u, v, depth, spacing = (values[indices] for values in (u, v, depth, spacing))
     if len(indices):
         pixel = max(1.0, pixel_width * view.fx * float(np.median(spacing / depth)))
-        place = np.floor(v / pixel).astype(np.int64) * (int(view.width / pixel) + 1)
-        place += np.floor(u / pixel).astype(np.int64)
-        nearest = np.full(place.max() + 1, np.inf)
-        np.minimum.at(nearest, place, depth)
-        shown = depth <= nearest[place] + MAX_BEHIND * spacing
+        cell = np.floor(v / pixel).astype(np.int64) * (int(view.width / pixel) + 1)
+        cell += np.floor(u / pixel).astype(np.int64)
+        nearest = np.full(cell.max() + 1, np.inf)
+        np.minimum.at(nearest, cell, depth)
+        shown = depth <= nearest[cell] + MAX_BEHIND * spacing
         indices, u, v, depth = (values[shown] for values in (indices, u, v, depth))
     return indices, (v.astype(np.int64), u.astype(np.int64)), depth

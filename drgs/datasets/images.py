@@ -16,9 +16,9 @@ import numpy as np
 from scipy import sparse
 
 from drgs.core.errors import UserError, UserNote, one_line
-from drgs.core.files import open_regular
+from drgs.core.files import open_regular, refuse_damage
 from drgs.core.memory import available_memory, format_bytes, require_memory
-from drgs.datasets.storage import MEMORY, Decode, DiskStore, MemoryStore, is_on_disk
+from drgs.datasets.storage import MEMORY, DiskStore, MemoryStore, is_on_disk
 from drgs.datasets.types import LazyImage, Pixels, View
 from drgs.io.images import (
     BITS,
@@ -105,14 +105,8 @@ def is_array(path: Path) -> bool:
 def _stored_depth(path: Path) -> np.ndarray:
     """Return the array (H, W) of an ``.npy`` file, mapped into memory."""
     open_regular(path, "depth", MAX_BYTES).close()
-    try:
-        with np.errstate(over="ignore"):  # of the size that a header claims
-            depth = np.load(path, mmap_mode="r", allow_pickle=False)
-    except MemoryError:
-        raise
-    except Exception as error:  # numpy raises many types for a broken header
-        reason = one_line(error) or type(error).__name__
-        raise UserError(f"{path}: cannot read the depth: {reason}") from None
+    with refuse_damage(f"{path}: cannot read the depth"), np.errstate(over="ignore"):
+        depth = np.load(path, mmap_mode="r", allow_pickle=False)
     is_real = isinstance(depth, np.ndarray) and depth.dtype.kind in "fiu"
     shape = depth.shape if is_real else ()
     if len(shape) == 2 or (len(shape) == 3 and shape[2] == 1):
@@ -187,9 +181,9 @@ def _average_rows(image: np.ndarray, count: int) -> np.ndarray:
         return total / np.float32(factor)
     edges = np.union1d(np.arange(length + 1), np.arange(1, count) * (length / count))
     middles = (edges[1:] + edges[:-1]) / 2  # of parts that are in one old and in one new pixel
-    place = (middles * count / length).astype(np.int64), middles.astype(np.int64)
+    cells = (middles * count / length).astype(np.int64), middles.astype(np.int64)
     shares = np.diff(edges) * (count / length)
-    weights = sparse.csr_array((shares.astype(np.float32), place), (count, length))
+    weights = sparse.csr_array((shares.astype(np.float32), cells), (count, length))
     return (weights @ image.reshape(length, -1)).reshape(count, *image.shape[1:])
 
 
@@ -259,14 +253,13 @@ def compact_photograph(
     background: tuple[float, float, float],
     max_width: int | None,
     store: MemoryStore = MEMORY,
-    source: tuple[Path, Decode] | None = None,
 ) -> tuple[Pixels, Pixels | None]:
     """Return ``image`` and ``alpha`` of a :class:`View` in a form that takes little memory.
 
     That is the file's pixels, or floats where they take less; numbers of 16 bits where scaling is
     by no whole factor, which takes long. Pixels with alpha that are halved can be shifted; those of
     photographs, which a lens has blurred, were measured to gain nothing. pixels: of
-    :func:`drgs.io.images.read_pixels`; source: their file, and what decodes it again.
+    :func:`drgs.io.images.read_pixels`.
     """
     height, width, channels = pixels.shape
     new_width, new_height = downscaled_size(width, height, max_width)
@@ -283,10 +276,7 @@ def compact_photograph(
     if width % new_width or height % new_height:
         quantized_alpha = _quantize(alpha(pixels), store) if channels == 4 else None
         return _quantize(image(pixels), store), quantized_alpha
-    if source is not None and new_width == width and channels == 3:
-        kept = store.keep_file(source[0], pixels, source[1])
-    else:  # decoding takes long beside an iteration, or is needed for the image and for alpha
-        kept = store.keep(pixels)
+    kept = store.keep(pixels)
     shape, on_disk = (new_height, new_width), store.is_on_disk
     if channels == 3:
         return LazyImage((*shape, 3), partial(image, kept), kept.nbytes, None, on_disk), None
@@ -342,7 +332,7 @@ def choose_store(
 
     Raises :class:`UserError` if the stored photographs do not fit into memory, or on the disk.
     """
-    needed, written = 0, 0  # bytes in memory; on disk
+    needed = 0  # bytes
     for file in files:
         header = read_header(file)
         (width, height), channels = header.size, 4 if header.has_alpha else 3
@@ -350,15 +340,13 @@ def choose_store(
         new_size = channels * new_width * new_height
         size = channels * width * height * BITS.get(header.mode, 8) // 8
         is_fractional = width % new_width or height % new_height
-        kept = min(4 * new_size, 2 * new_size if is_fractional else size)
-        needed += kept
-        written += kept if new_width < width or channels == 4 else 0
+        needed += min(4 * new_size, 2 * new_size if is_fractional else size)
     available = available_memory()
     if in_memory is False:
-        return DiskStore(written, len(files))
+        return DiskStore(needed, len(files))
     if in_memory is None and needed > MAX_MEMORY_SHARE * available:
         try:
-            store = DiskStore(written, len(files))
+            store = DiskStore(needed, len(files))
         except UserError:
             if needed > available:
                 raise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import numpy as np
 from drgs.core.errors import UserNote, format_names, one_line
 from drgs.core.folders import digest
 from drgs.datasets.types import View
-from drgs.io.images import unused_content
+from drgs.io.images import colour_profile
 
 MAX_NOTE_CHARACTERS = 1000
 
@@ -27,42 +27,24 @@ class Notices:
 
     def inspect(self, file: Path, pixels: np.ndarray) -> None:
         """Record findings on a photograph; pixels: (H, W, C), as they were read."""
-        findings = unused_content(file)
+        findings = []
+        if profile := colour_profile(file):
+            findings.append(f"with the colour profile {profile}, which is not applied")
         if pixels.shape[2] == 4 and not pixels[:, :, 3].any():
             findings.append("that are transparent everywhere")
         for finding in findings:
             self._findings.setdefault(finding, []).append(self._name(file))
 
-    def emit(
-        self,
-        notes: Sequence[str],
-        train: Sequence[View],
-        test: Sequence[View],
-        cloud: Path | None = None,
-    ) -> None:
+    def emit(self, notes: Sequence[str], train: Sequence[View], test: Sequence[View]) -> None:
         """Emit ``notes`` and the findings, each as a :class:`UserNote`."""
-        files = {path for view in (*train, *test) for path in view.files.values()}
-        own = [f"photographs {what}: {_format_files(n)}" for what, n in self._findings.items()]
-        if outside := self._files_outside(files if cloud is None else {*files, cloud}):
-            own.append(f"files from outside of the folder: {_format_files(outside)}")
-        own += self._duplicate_notes(train, test)
-        for note in (*notes, *(f"{self._folder}: {text}" for text in own)):
+        texts = [f"photographs {what}: {_format_files(n)}" for what, n in self._findings.items()]
+        texts += self._duplicate_notes(train, test)
+        for note in (*notes, *(f"{self._folder}: {text}" for text in texts)):
             warnings.warn(UserNote(one_line(note, MAX_NOTE_CHARACTERS)), stacklevel=2)
 
     def _name(self, file: Path) -> str:
         is_below = file.is_relative_to(self._folder)
         return str(file.relative_to(self._folder) if is_below else file)
-
-    def _files_outside(self, files: Iterable[Path]) -> list[str]:
-        """Return files that lie elsewhere, by their names or by links."""
-        root, folder_of = os.path.realpath(self._folder), cache(os.path.realpath)
-        found = []
-        for file in files:
-            real = os.path.join(folder_of(file.parent), file.name)
-            real = os.path.realpath(file) if file.is_symlink() else real
-            if os.path.commonpath([root, real]) != root:
-                found.append(real)
-        return found
 
     def _duplicate_notes(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
         """Return a note on duplicate photographs, or none."""

@@ -38,7 +38,7 @@ from drgs.datasets.images import (
 )
 from drgs.datasets.notices import Notices
 from drgs.datasets.splits import Lists, split_of
-from drgs.datasets.storage import Decode, MemoryStore
+from drgs.datasets.storage import MemoryStore
 from drgs.datasets.transforms import (
     CLOSE_POSE_KEY,
     TransformsFrame,
@@ -119,7 +119,7 @@ class DatasetReader:
         views = dict(zip(used, views, strict=True))
         train, test = (tuple(views[i] for i in indices) for indices in (split.train, split.test))
         measured = () if split.name == "train" else test
-        notices.emit(photographs.notes, train, measured, photographs.point_cloud)
+        notices.emit(photographs.notes, train, measured)
         ignored, extras = describe_extras(config, frames)
         return Dataset(
             train=train,
@@ -163,17 +163,15 @@ def load_views(
     def load(frame: TransformsFrame, name: str) -> View:
         file, is_read = frame.files["image"], keeps(name)
 
-        def decode() -> np.ndarray:
-            return orient_as_calibrated(read_pixels(file), frame)
-
-        pixels = decode() if is_read else orient_as_calibrated(placeholder_pixels(file), frame)
+        pixels = read_pixels(file) if is_read else placeholder_pixels(file)
+        pixels = orient_as_calibrated(pixels, frame)
         if is_read:
             notices.inspect(file, pixels)
         height, width = pixels.shape[:2]
         size = downscaled_size(width, height, config.image_size)
         camera = intrinsics(frame, pixels.shape, size)  # first: raises for a wrong size
         image, alpha, mask, depth = (
-            _read_images(config, frame, pixels, decode, store)
+            _read_images(config, frame, pixels, store)
             if is_read
             else _unread_images(frame, pixels, size)
         )
@@ -277,14 +275,10 @@ def _read_images(
     config: DataConfig,
     frame: TransformsFrame,
     pixels: np.ndarray,
-    decode: Decode,
     store: MemoryStore,
 ) -> Images:
     files, stored, depth = frame.files, (pixels.shape[1], pixels.shape[0]), None
-    source = files["image"], decode
-    image, alpha = compact_photograph(
-        pixels, config.background_rgb, config.image_size, store, source
-    )
+    image, alpha = compact_photograph(pixels, config.background_rgb, config.image_size, store)
     mask = _mask(config, files["mask"], stored, store) if "mask" in files else None
     if "depth" in files:
         depth = read_depth(files["depth"], _depth_unit(frame), stored)
@@ -325,13 +319,13 @@ def describe_extras(
 ) -> tuple[tuple[str, ...], str]:
     """Return the names of ignored data (distortion, motion, masks, depth) and a description."""
     lenses = list(filter(None, map(lens_of, frames)))
-    found = {
+    data = {
         "distortion": [lens for lens in lenses if lens.distorts],
         "motion": [f for f in frames if f.values.transform_matrix_close is not None],
         "masks": [f for f in frames if f.values.mask_path],
         "depth": [f for f in frames if f.values.depth_file_path],
     }
-    ignored = tuple(k for k, have in found.items() if have and getattr(config, f"ignore_{k}"))
+    ignored = tuple(k for k, have in data.items() if have and getattr(config, f"ignore_{k}"))
     text = ""
     if names := sorted({lens.describe() for lens in lenses}):
         text += f"; lens {' and '.join(names)}" + " ignored" * ("distortion" in ignored)

@@ -51,7 +51,7 @@ def listed_frames(
 
     Raises :class:`UserError` where fewer than half of a list are names of frames.
     """
-    found, unknown = _match_names(listing, names)
+    matched, unknown = _match_names(listing, names)
     if len(unknown) > (1 - MIN_FOUND_SHARE) * len(listing):
         raise UserError(
             f"{source}: {key} must list the photographs of frames, but {len(unknown):,} of its "
@@ -60,7 +60,7 @@ def listed_frames(
         )
     if unknown:
         notes.append(f"{source}: {key} has names that no frame has: {format_names(unknown)}")
-    return found
+    return matched
 
 
 def _match_names(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str], list[str]]:
@@ -69,15 +69,15 @@ def _match_names(listing: Sequence[str], names: Sequence[str]) -> tuple[set[str]
     loose: dict[str, set[str]] = {}
     for name in names:
         loose.setdefault(_loose_key(name), set()).add(name)
-    found, unknown = set(), []
+    matched, unknown = set(), []
     for name in listing:
         same = exact.get("/".join(parts_of(name)))
         candidates = loose.get(_loose_key(name), set()) if same is None else {same}
         if len(candidates) == 1:
-            found |= candidates
+            matched |= candidates
         else:
             unknown.append(one_line(name, 100))
-    return found, unknown
+    return matched, unknown
 
 
 def _loose_key(name: str) -> str:
@@ -97,24 +97,24 @@ def unlisted_splits(
     a name of a frame is another program's.
     """
     for folder in folders:
-        found = {}
+        lists = {}
         for split in SPLITS:
             if (file := folder / f"{split}.txt").is_file():
                 lines = map(str.strip, read_text(file, "list of names", MAX_LIST_BYTES).split("\n"))
                 listing = [line for line in lines if line and not line.startswith("#")]
                 if _match_names(listing, names)[0]:
-                    found[split] = listed_frames(folder, file.name, listing, names, notes)
+                    lists[split] = listed_frames(folder, file.name, listing, names, notes)
                 else:
                     notes.append(f"{file}: lists no photograph, and is not read")
-        if found:
-            return Lists(found, " and ".join(f"{split}.txt" for split in found))
-    found = {}
+        if lists:
+            return Lists(lists, " and ".join(f"{split}.txt" for split in lists))
+    lists = {}
     for name in names:
         below = [part for part in map(key_of, parts_of(name)[:-1]) if part in SPLITS]
         if not below:
             return None
-        found.setdefault(below[-1], set()).add(name)
-    return Lists(found, "folders") if len(found) > 1 and "train" in found else None
+        lists.setdefault(below[-1], set()).add(name)
+    return Lists(lists, "folders") if len(lists) > 1 and "train" in lists else None
 
 
 def split_of(

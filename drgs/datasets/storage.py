@@ -1,33 +1,27 @@
 """Stores of photographs' pixels while a fit uses them: memory, or a disk.
 
-Photographs that would not fit into memory are on disk. An opaque one that is not scaled is decoded
-again from its own file at each use. What takes longer is written once to a temporary file, which
-the system removes with the process, however that ends.
+Photographs that would not fit into memory are in a temporary file, which the system removes with
+the process, however that ends.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import tempfile
 import threading
 import weakref
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-import psutil
 from typing_extensions import override
 
 from drgs.core.errors import UserError
 from drgs.core.files import refusal_reason
 from drgs.core.memory import format_bytes
 from drgs.datasets.types import LazyImage, Pixels, View
-
-Decode = Callable[[], np.ndarray]  # returns a photograph's pixels from its file
-
-FILE_SYSTEMS_IN_MEMORY = {"tmpfs", "ramfs"}
 
 LARGER_DISK = (
     "set TMPDIR to a folder of a larger disk or a smaller data.image_size, or use fewer of them"
@@ -43,14 +37,9 @@ class MemoryStore:
         """Return the array, or a lazy image that becomes the same one."""
         return array
 
-    def keep_file(self, file: Path, pixels: np.ndarray, decode: Decode) -> Pixels:
-        """Return the pixels, or a lazy image that decodes their file again."""
-        del file, decode
-        return pixels
-
 
 class DiskStore(MemoryStore):
-    """Writes pixels to a temporary file of :func:`scratch_folder`, and reads them at each use."""
+    """Writes pixels to a temporary file in ``TMPDIR`` or else ``/var/tmp``."""
 
     is_on_disk = True
 
@@ -59,7 +48,9 @@ class DiskStore(MemoryStore):
 
         Raises :class:`UserError` unless a disk has room for them.
         """
-        self._folder, self._lock = scratch_folder(), threading.Lock()
+        # Many systems have /tmp in memory.
+        self._folder = Path(os.environ.get("TMPDIR", "/var/tmp"))
+        self._lock = threading.Lock()
         try:
             free = shutil.disk_usage(self._folder).free
             if num_bytes > free:
@@ -79,11 +70,10 @@ class DiskStore(MemoryStore):
     @override
     def keep(self, array: np.ndarray) -> LazyImage:
         """Write the array; several threads may."""
-        array = np.ascontiguousarray(array)
         try:
             with self._lock:
                 position = self._file.seek(0, os.SEEK_END)
-                self._file.write(array.data)
+                self._file.write(np.ascontiguousarray(array).data)
                 self._file.flush()
         except OSError as error:
             raise self._error("cannot write photographs", error) from None
@@ -91,66 +81,14 @@ class DiskStore(MemoryStore):
         return LazyImage(array.shape, read, 0, is_on_disk=True)
 
     def _read(self, position: int, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        array = np.empty(shape, dtype)
         try:
-            with self._lock:
-                self._file.seek(position)
-                count = self._file.readinto(array.data.cast("B"))
+            content = os.pread(self._file.fileno(), math.prod(shape) * dtype.itemsize, position)
         except OSError as error:
             raise self._error("cannot read photographs again", error) from None
-        if count != array.nbytes:
-            raise UserError(
-                f"{self._folder}: the temporary file of photographs was cut short during the fit; "
-                "continue it with --resume"
-            )
-        return array
-
-    @override
-    def keep_file(self, file: Path, pixels: np.ndarray, decode: Decode) -> LazyImage:
-        """Return an image that decodes the file again, which must stay as it is now."""
-        before = _status(file)
-
-        def decode_again() -> np.ndarray:
-            if (now := _status(file)) != before:
-                found = "it is gone" if now is None else "it has changed"
-                raise UserError(
-                    f"{file}: must stay as it is during a fit that reads it from disk "
-                    f"(data.in_memory), but {found}; put it back, and continue with --resume"
-                )
-            return decode()
-
-        return LazyImage(pixels.shape, decode_again, 0, is_on_disk=True)
+        return np.frombuffer(bytearray(content), dtype).reshape(shape)
 
 
 MEMORY = MemoryStore()
-
-
-def scratch_folder() -> Path:
-    """Return the folder of temporary files, or /var/tmp where that one is in memory.
-
-    Raises :class:`UserError` where both are.
-    """
-    folders = [Path(tempfile.gettempdir()), Path("/var/tmp")]
-    mounts = {Path(p.mountpoint): p.fstype for p in psutil.disk_partitions(all=True)}
-    for folder in folders:
-        place = folder.resolve()
-        if folder.is_dir() and not FILE_SYSTEMS_IN_MEMORY & {
-            next((mounts[above] for above in (place, *place.parents) if above in mounts), "")
-        }:
-            return folder
-    raise UserError(
-        f"{folders[0]}: is in memory, and photographs that do not fit there (data.in_memory) are "
-        "to be on a disk; set TMPDIR to a folder of one"
-    )
-
-
-def _status(file: Path) -> tuple[int, int] | None:
-    """Return size and time of a file, by which a change is noticed; None: there is none."""
-    try:
-        status = file.stat()
-    except OSError:
-        return None
-    return status.st_size, status.st_mtime_ns
 
 
 def is_on_disk(view: View) -> bool:

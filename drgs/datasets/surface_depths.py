@@ -109,8 +109,8 @@ def _mesh_depth(scene: mi.Scene, view: Viewpoint) -> np.ndarray:
     ray = mi.Ray3f(mi.Point3f(camera.center + to_world @ origin), mi.Vector3f(to_world @ direction))
     hit = scene.ray_intersect_preliminary(ray)
     met = hit.is_valid() & is_ray
-    seen, _, depth = camera.lens.visibility(camera, origin + dr.select(met, hit.t, 1) * direction)
-    return dr.select(met & seen, depth, 0).numpy().reshape(view.height, view.width)
+    shown, _, depth = camera.lens.visibility(camera, origin + dr.select(met, hit.t, 1) * direction)
+    return dr.select(met & shown, depth, 0).numpy().reshape(view.height, view.width)
 
 
 def _point_depths(path: Path, points: np.ndarray) -> Callable[[Viewpoint], np.ndarray]:

@@ -18,22 +18,13 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    GetPydanticSchema,
-    Strict,
-    ValidationError,
-)
-from pydantic_core import ErrorDetails
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetPydanticSchema, Strict
 from pydantic_core.core_schema import no_info_after_validator_function
 
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.cameras.viewpoints import MAX_COORDINATE, CameraMotion
 from drgs.config.schema import DataConfig
-from drgs.config.section import expectation
+from drgs.config.section import parse_json, validate
 from drgs.core.errors import UserError, format_names, one_line
 from drgs.core.files import read_text, shorten_stem
 from drgs.core.registry import HOW_TO_INSTALL
@@ -225,13 +216,9 @@ class TransformsFrame:
         values = {"fl_x": focal[0], "fl_y": focal[1], "file_path": image.name}
         if principal is not None:
             values |= {"cx": principal[0], "cy": principal[1]}
-        try:
-            own = FrameValues.model_validate({**values, "transform_matrix": opengl.tolist()})
-        except ValidationError as error:
-            raise UserError(
-                f"{source}: frame {index}: {_explain_error(error.errors()[0])}"
-            ) from None
-        return TransformsFrame(own, source, f"frames[{index}].", files={"image": image})
+        values |= {"transform_matrix": opengl.tolist()}
+        checked = validate(FrameValues, values, f"{source}: frame {index}: ")
+        return TransformsFrame(checked, source, f"frames[{index}].", files={"image": image})
 
     @property
     def file_path(self) -> str:
@@ -261,17 +248,12 @@ def read_transforms(path: Path) -> TransformsFile:
     Raises :class:`UserError` naming the file, the key, the expected and the actual value.
     """
     text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
-    try:
-        meta = Transforms.model_validate(json.loads(text))
-    except ValidationError as error:
-        raise UserError(f"{path}: {_explain_error(error.errors()[0])}") from None
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: not valid JSON: {one_line(error)}") from None
+    meta = validate(Transforms, parse_json(text, f"{path}: "), f"{path}: ")
     top = {name: getattr(meta, name) for name in CameraValues.model_fields} | _extra(meta)
     frames = []
-    for index, own in enumerate(meta.frames):
-        inherited = {key: value for key, value in top.items() if getattr(own, key, None) is None}
-        values = own.model_copy(update=inherited)
+    for index, frame in enumerate(meta.frames):
+        inherited = {key: value for key, value in top.items() if getattr(frame, key, None) is None}
+        values = frame.model_copy(update=inherited)
         frames.append(TransformsFrame(values, path, f"frames[{index}].", inherited.keys()))
     names = {split: getattr(meta, f"{split}_filenames") for split in ("train", "val", "test")}
     lists = {split: listing for split, listing in names.items() if listing}
@@ -305,21 +287,6 @@ def _coefficient_names(model: str | None) -> tuple[str, ...]:
     return LENSES.get(model).value.coefficient_names()
 
 
-def _explain_error(error: ErrorDetails) -> str:
-    """Return the key, the expectation and the value of one of pydantic's errors."""
-    parts = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]]
-    key = "".join(parts).removeprefix(".")
-    if error["type"] == "missing":
-        return f"{key} is missing"
-    own = {"model_type": "must be an object", "too_short": "must have at least one entry"}
-    expected = own.get(error["type"]) or expectation(error)
-    return f"{key or 'the content'} {expected}, got {_show(error['input'])}"
-
-
-def _show(value: object) -> str:
-    return one_line(json.dumps(value), limit=60)
-
-
 # Files of frames
 
 
@@ -341,12 +308,12 @@ def frames_with_files(
             continue
         names = [getattr(frame.values, key) for frame in naming]
         places = [frame.location(key) for frame in naming]
-        found = find_files(config.path, meta.path, names, FILE_KINDS[what], places, notes)
+        existing = find_files(config.path, meta.path, names, FILE_KINDS[what], places, notes)
         kept = []
         for frame in frames:
             name = getattr(frame.values, key)
-            if name in found:
-                kept.append(replace(frame, files={**frame.files, what: found[name]}))
+            if name in existing:
+                kept.append(replace(frame, files={**frame.files, what: existing[name]}))
             elif name is None or what == "depth":
                 kept.append(frame)
         frames = kept
@@ -358,8 +325,8 @@ def find_point_cloud(config: DataConfig, meta: TransformsFile, notes: list[str])
     if meta.point_cloud is None or config.ignore_points:
         return None
     names, places = [meta.point_cloud], ["ply_file_path"]
-    found = find_files(config.path, meta.path, names, POINT_CLOUD, places, notes)
-    return found.get(meta.point_cloud)
+    existing = find_files(config.path, meta.path, names, POINT_CLOUD, places, notes)
+    return existing.get(meta.point_cloud)
 
 
 # Optics
@@ -404,7 +371,8 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
     given = {k: v for k in names if (v := getattr(values, k, None)) is not None}
     for key, value in given.items():
         if type(value) not in (int, float) or not math.isfinite(value):
-            raise UserError(f"{frame.location(key)} must be a finite number, got {_show(value)}")
+            got = one_line(json.dumps(value), 60)
+            raise UserError(f"{frame.location(key)} must be a finite number, got {got}")
     if is_of_colmap:
         given = {key: value for key, value in given.items() if value}
         if name == "opencv":

@@ -1,4 +1,4 @@
-"""Find out which effects photographs call for.
+"""Find out which effects photographs need.
 
 Python gives ``drgs.examine`` to this package as soon as one of its modules is imported: so the
 package can be called, and stands for :func:`drgs.examine.examination.examine`.

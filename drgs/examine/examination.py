@@ -1,4 +1,4 @@
-"""Effects that a dataset calls for, chosen by measurement: :func:`examine`.
+"""Effects that a dataset needs, chosen by measurement: :func:`examine`.
 
 A short fit leaves some training photographs out. What they differ by from its renderings shows
 which effects are likely (:class:`drgs.effects.base.Finding`); each of these is simulated in a
@@ -131,7 +131,7 @@ def examine(
     config: FitConfig | Mapping[str, object] | None = None,
     progress: Progress | None = None,
 ) -> Examination:
-    """Return which effects the dataset's training photographs call for, with the evidence.
+    """Return which effects the dataset's training photographs need, with the evidence.
 
     config: of the fit, or nested mappings, by default all defaults; effects whose keys it gives are
     not examined. With a fit that is too short, or fewer than 20 training photographs, nothing is
@@ -149,10 +149,10 @@ def examine(
         return Examination((), 0, 0.0, note)
     given, short = given_keys(config), _shorten(resolve_defaults(config, dataset))
     split, factor = split_views(dataset)
-    progress = progress or _show_nothing
+    progress = progress or (lambda what, done, total: None)
     if mi.variant() is None:
         select_variant(VARIANTS[0])
-    base = short_fit(short, split, factor, partial(progress, "no effect"))
+    base = short_fit(short, split, factor, partial(progress, "baseline"))
     decisions = []
     for finding in _findings(base):
         if any(overlaps(key, other) for key in finding.changes for other in given):

@@ -7,7 +7,6 @@ Exports a file, or a fit's file for other programs (``drgs.fit.viewers_fit``), i
 from __future__ import annotations
 
 import argparse
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.cameras.orbits import near_plane_of, rings_around, up_of
+from drgs.cameras.orbits import up_of
 from drgs.cli.commands import (
     CommandParser,
     bounded_int,
@@ -23,27 +22,20 @@ from drgs.cli.commands import (
     run_command,
 )
 from drgs.cli.execution import select_variant
-from drgs.config.approximations import DECLARED, Approximations, from_ply_header
-from drgs.config.schema import ModelConfig
+from drgs.config.approximations import DECLARED, Approximations
 from drgs.core.constants import LOW_PASS
 from drgs.core.environment import require_module
-from drgs.core.errors import UserError, UserNote, did_you_mean, one_line
+from drgs.core.errors import UserError, did_you_mean, one_line
 from drgs.core.files import atomic_path
 from drgs.core.folders import FolderRecord
 from drgs.core.registry import HOW_TO_INSTALL
-from drgs.effects.smoothing import bake_smoothing
 from drgs.export.cleaning import add_cleaning_arguments, clean, reduce_to
 from drgs.export.levels import LOD_META, encode_levels
-from drgs.export.selection import take
-from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.similarity import rotation_towards, shortest_rotation
+from drgs.export.source import ExportSource, Honoured, load_source
 from drgs.io import sog
 from drgs.io.formats import format_for, writable_formats
-from drgs.io.quantization import morton_order
-from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, VIEWS
-from drgs.results.folder import load_run_config
+from drgs.results.files import VIEWS
 from drgs.results.html_viewer import HONOURED, DisplaySettings, InitialView, viewer_page
-from drgs.results.refined_cameras import training_cameras
 
 COMMAND = "export"
 
@@ -61,22 +53,6 @@ MESH_SIZE, MESH_SIZES = 256, (16, 2048)  # voxels along the longest side: defaul
 MIN_SNAP_COSINE = np.cos(np.radians(5))  # angle below which the cameras' up is snapped to an axis
 
 
-@dataclass(frozen=True)
-class ExportSource:
-    """Gaussians to export."""
-
-    gaussians: Gaussians[np.ndarray]  # without a smoothing filter
-    path: Path  # of the file
-    folder: Path | None  # of the fit; None: a file was named
-    rotation: np.ndarray | None = None  # (3, 3) that the Gaussians were turned by, not the cameras
-    mesh_size: int = MESH_SIZE
-    suffix: str = ""  # of the output, in small letters
-
-
-Honoured = Callable[[Approximations], frozenset[str]]
-"""Function from fitted approximations to the names of those that a program honours, about."""
-
-
 def _honoured_by_playcanvas(fitted: Approximations) -> frozenset[str]:
     ours = abs(fitted.low_pass - PLAYCANVAS_LOW_PASS)
     return HONOURED if ours < abs(fitted.low_pass - LOW_PASS) else frozenset()
@@ -88,7 +64,7 @@ class ExportTarget:
 
     suffix: str  # of files, in small letters
     text: str  # description, one phrase
-    encode: Callable[[ExportSource], bytes]  # deterministic
+    encode: Callable[..., bytes]  # of a source and the output file; deterministic
     up: np.ndarray  # (3,) in programs
     has_axes: bool = False  # whether the format defines up: then models are always turned
     honoured: Honoured | None = None  # None: none
@@ -96,32 +72,29 @@ class ExportTarget:
 
 def targets() -> dict[str, ExportTarget]:
     """Return the targets of ``--format`` by name: file formats, and the page."""
-    found = {
+    formats = {
         each.name: ExportTarget(
             suffix=each.value.suffix,
             text=each.value.description,
-            encode=lambda source, name=each.name: source.gaussians.to_bytes(name),
+            encode=lambda source, _, name=each.name: source.gaussians.to_bytes(name),
             up=Y_DOWN if each.value.up is None else Z_UP,
             has_axes=each.value.up is not None,
             honoured=_honoured_by_playcanvas if each.name in PLAYCANVAS else None,
         )
         for each in writable_formats()
     }
-    return {**found, "html": PAGE, "mesh": MESH}
+    return {**formats, "html": PAGE, "mesh": MESH}
 
 
-def _page(source: ExportSource) -> bytes:
+def _page(source: ExportSource, out: Path) -> bytes:
     """Encode a page with the first view and the background of the fit; else black."""
-    gaussians, folder = source.gaussians, source.folder
-    title, background, cameras = source.path.name, (0.0, 0.0, 0.0), None
-    if folder is not None:
-        title = folder.resolve().name
-        background = load_run_config(folder).data.background_rgb
-        cameras = training_cameras(folder, gaussians.origin) if source.rotation is None else None
-    if cameras is not None:
-        initial_view = InitialView.from_views(cameras, gaussians)
+    gaussians, config = source.gaussians, source.config
+    if source.cameras is not None and not source.is_turned:
+        initial_view = InitialView.from_views(source.cameras, gaussians)
     else:
         initial_view = InitialView.from_gaussians(gaussians, Z_UP)
+    title = source.path.name if config is None else source.path.parent.resolve().name
+    background = (0.0, 0.0, 0.0) if config is None else config.data.background_rgb
     shown = DisplaySettings(gaussians, Approximations.from_values(gaussians.rendered_with or {}))
     return viewer_page(title, shown, initial_view, background)
 
@@ -130,30 +103,18 @@ _PAGE_TEXT = "a page to walk around in, for any browser"
 PAGE = ExportTarget(".html", _PAGE_TEXT, _page, Z_UP, honoured=lambda _: HONOURED)
 
 
-def _mesh(source: ExportSource) -> bytes:
+def _mesh(source: ExportSource, out: Path, size: int = MESH_SIZE) -> bytes:
     """Encode the surface that the fit's training cameras see; for a file, cameras around it."""
     from drgs.export import mesh as surface
 
     for module in surface.MODULES:  # before anything is rendered
         require_module(module, "mesh", "--format mesh")
-    gaussians, folder, turn = source.gaussians, source.folder, np.eye(4)
-    turn[:3, :3] = np.eye(3) if source.rotation is None else source.rotation
-    if folder is None:
-        near, cameras = near_plane_of(gaussians), None
-    else:
-        x, y, z = (turn[:3, :3].T @ gaussians.origin).tolist()
-        near, cameras = load_run_config(folder).model.near, training_cameras(folder, (x, y, z))
-    if cameras is None:
-        cameras = rings_around(gaussians, Z_UP, surface.VIEWS_PER_RING, surface.RING_SIDE_PX)
-    else:
-        cameras = [replace(v, camera_to_world=turn @ v.camera_to_world) for v in cameras]
-    recorded = from_ply_header(str(source.path), gaussians.rendered_with or {})
-    model = ModelConfig(near=near).with_3dgs_defaults().model_copy(update=recorded)
-    images = list(surface.depth_images(gaussians, model, cameras))
-    mesh = surface.mesh_of(images, source.mesh_size)
+    views = source.views(Z_UP, surface.VIEWS_PER_RING, surface.RING_SIDE_PX)
+    images = list(surface.depth_images(source.gaussians, source.settings, views))
+    mesh = surface.mesh_of(images, size)
     print(f"{len(images)} views: {len(mesh.faces):,} triangles")
-    encode = surface.encode_glb if source.suffix == ".glb" else surface.encode_ply
-    return encode(mesh, gaussians.origin)
+    encode = surface.encode_glb if out.suffix.lower() == ".glb" else surface.encode_ply
+    return encode(mesh, source.gaussians.origin)
 
 
 _MESH_TEXT = "the surface as triangles with colours (.ply or .glb)"
@@ -205,21 +166,13 @@ def add_arguments(parser: CommandParser) -> None:
         f"--decimate), as PlayCanvas streams them: {LOD_META} beside folders of SOG",
     )
     add_cleaning_arguments(parser)
-    add = parser.add_argument_group("orientation and order").add_argument
-    add(
+    parser.add_argument_group("orientation").add_argument(
         "--up",
         nargs="+",
         metavar="UP",
         help="rotate the model so that this direction, X Y Z, is up; cameras: the mean up "
         "direction of the training cameras (default: for formats with an up direction, cameras, or "
         "0 0 1 without any; other formats are not rotated)",
-    )
-    add(
-        "--order",
-        choices=("file", "morton"),
-        default="file",
-        help="morton: sort along a space-filling curve (default: order of the input, or of the "
-        "format)",
     )
     parser.set_defaults(run=run)
 
@@ -234,25 +187,21 @@ def run(args: argparse.Namespace) -> None:
     coarse = [f"{level}_0/{sog.META}" for level in range(args.levels or 0)]
     FolderRecord(out.parent, COMMAND).check([*coarse, out.name])
     up = _up_direction(args, source, target)
-    gaussians = clean(source.gaussians, source.path, args)
+    source = clean(source, args)
     if args.decimate is not None or args.levels is not None or target.encode is _mesh:
         select_variant(args.variant)
     axis = Z_UP if up is None else up
     if args.decimate is not None:
-        count = args.decimate(gaussians.num_gaussians)
-        gaussians = reduce_to(gaussians, count, source.folder, axis)
-    counts = [-(-gaussians.num_gaussians // 2**k) for k in range(1, args.levels or 1)]
-    levels = [gaussians, *(reduce_to(gaussians, count, source.folder, axis) for count in counts)]
+        source = reduce_to(source, args.decimate(source.gaussians.num_gaussians), axis)
+    most = source.gaussians.num_gaussians
+    counts = [-(-most // 2**k) for k in range(1, args.levels or 1)]
+    levels = [source, *(reduce_to(source, count, axis) for count in counts)]
     if up is not None:
-        levels = [rotation_towards(each, up, target.up) for each in levels]
-        source = replace(source, rotation=shortest_rotation(up, target.up))
-    if args.order == "morton":
-        levels = [take(each, morton_order(each.means)) for each in levels]
+        levels = [each.turn(up, target.up) for each in levels]
     if args.levels is not None:
-        files = encode_levels(levels)
+        files = encode_levels([each.gaussians for each in levels])
     else:
-        output = {"mesh_size": args.mesh_size or MESH_SIZE, "suffix": out.suffix.lower()}
-        content = target.encode(replace(source, gaussians=levels[0], **output))
+        content = target.encode(levels[0], out, *filter(None, [args.mesh_size]))
         files = sog.unpack(content) if _is_named(out, sog.META) else {out.name: content}
     if source.path.resolve() in {(out.parent / path).resolve() for path in files}:
         raise UserError(f"--out {out}: would replace {source.path}, the input; choose another name")
@@ -262,42 +211,6 @@ def run(args: argparse.Namespace) -> None:
             temporary.write_bytes(content)
     FolderRecord(out.parent, COMMAND).seal()
     print(f"written: {out} ({sum(map(len, files.values())) / 1e6:.1f} MB)")
-
-
-def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
-    """Load a file, or a fit's Gaussians for other programs, and bake in a smoothing filter.
-
-    honoured: by the target; if that is enough, the fit's own Gaussians are loaded. Other
-    non-default approximations of the file give a :class:`UserNote`.
-    """
-    if not what.exists():
-        raise UserError(f"{what}: there is no such file or folder")
-    path = what
-    if what.is_dir():
-        names = [name for name in (GAUSSIANS_FOR_VIEWERS, GAUSSIANS) if (what / name).is_file()]
-        if not names or not (what / CONFIG).is_file():
-            raise UserError(
-                f"{what}: must be the output folder of a fit that has ended, but there is no "
-                f"{CONFIG if names else GAUSSIANS} in it"
-            )
-        shows_own = False
-        if honoured is not None:
-            fitted = load_run_config(what).model.approximations
-            shows_own = fitted.non_default.keys() <= honoured(fitted)
-        path = what / (names[-1] if shows_own else names[0])
-    gaussians = Gaussians.load(path)
-    recorded = from_ply_header(str(path), gaussians.rendered_with or {})
-    others = {name: value for name, value in recorded.items() if value != DECLARED[name].default}
-    shown = frozenset() if honoured is None else honoured(Approximations.from_values(recorded))
-    if unknown := [f"{k} {str(v).lower()}" for k, v in others.items() if k not in shown]:
-        beside = path.with_name(GAUSSIANS_FOR_VIEWERS)
-        note = (
-            f"{path}: made to be rendered with {', '.join(unknown)}; programs that do not will "
-            "show it otherwise" + (f"; export {beside} instead" if beside.is_file() else "")
-        )
-        warnings.warn(UserNote(note), stacklevel=2)
-    gaussians = bake_smoothing(replace(gaussians, rendered_with=others or None))
-    return ExportSource(gaussians, path, what if what.is_dir() else None)
 
 
 def _destination(args: argparse.Namespace) -> tuple[ExportTarget, Path]:
@@ -314,20 +227,20 @@ def _destination(args: argparse.Namespace) -> tuple[ExportTarget, Path]:
         raise UserError(f"--mesh-size: is for --format mesh, got {name}; leave it out")
     if args.out is None:
         read_as = format_for(args.what)
-        place = args.what.resolve()
-        place = place.parent if _is_named(place, sog.META) else place
-        stem = args.what.name[: -len(read_as.value.suffix)] if read_as else place.name
+        path = args.what.resolve()
+        path = path.parent if _is_named(path, sog.META) else path
+        stem = args.what.name[: -len(read_as.value.suffix)] if read_as else path.name
         if args.levels is not None:
-            return target, place.with_name(f"{stem}_levels") / LOD_META
-        return target, place.with_name(f"{stem}{target.suffix}")
-    found = _target_name(args.out)  # as a.compressed.ply is no name for a plain PLY
-    if name == "mesh" and found in ("ply", "glb"):
-        return replace(target, has_axes=found == "glb"), args.out
-    if found != name:
+            return target, path.with_name(f"{stem}_levels") / LOD_META
+        return target, path.with_name(f"{stem}{target.suffix}")
+    named = _target_name(args.out)  # as a.compressed.ply is no name for a plain PLY
+    if name == "mesh" and named in ("ply", "glb"):
+        return replace(target, has_axes=named == "glb"), args.out
+    if named != name:
         ends = ".ply or .glb" if name == "mesh" else target.suffix
         raise UserError(
             f"--out {args.out}: the name of a {name} file must end in {ends}, got that of "
-            f"{f'a {found}' if found else 'no known'} file"
+            f"{f'a {named}' if named else 'no known'} file"
         )
     return target, args.out
 
@@ -352,19 +265,17 @@ def _target_name(path: Path) -> str | None:
         return "html"
     if _is_named(path, sog.META) or _is_named(path, LOD_META):
         return "sog"
-    found = format_for(path)
-    return None if found is None else found.name
+    file_format = format_for(path)
+    return None if file_format is None else file_format.name
 
 
 def _up_direction(
     args: argparse.Namespace, source: ExportSource, target: ExportTarget
 ) -> np.ndarray | None:
     """Return and print the up direction (3,); None: do not turn the model."""
-    words = args.up
+    words, cameras = args.up, source.cameras
     if words is None and not target.has_axes:
         return None
-    folder, origin = source.folder, source.gaussians.origin
-    cameras = None if folder is None else training_cameras(folder, origin)
     if words is None:
         words = ["0", "0", "1"] if cameras is None else ["cameras"]
     if words == ["cameras"]:

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drgs.cameras.orbits import extent_of, near_plane_of, rings_around
+from drgs.cameras.orbits import extent_of
 from drgs.cli.commands import CommandParser, bounded_int, finite_number
 from drgs.cli.execution import add_variant_argument, execution_settings
-from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError, one_line
-from drgs.export.selection import find_kept, take
+from drgs.export.merging import take
+from drgs.export.source import ExportSource
 from drgs.export.voxels import CLUSTER, FLOATERS, VoxelRule, find_cluster, find_non_floaters
 from drgs.gaussians.parameters import Gaussians
-from drgs.results.folder import load_run_config
-from drgs.results.refined_cameras import training_cameras
 
 GREY = (0.5, 0.5, 0.5)  # background where none is known: neither hides white nor black
 
@@ -116,61 +113,66 @@ def _count_or_percentage(text: str) -> Callable[[int], int]:
     return lambda before: max(1, round(share * before))
 
 
-def clean(
-    gaussians: Gaussians[np.ndarray], path: Path, args: argparse.Namespace
-) -> Gaussians[np.ndarray]:
+def clean(source: ExportSource, args: argparse.Namespace) -> ExportSource:
     """Return the Gaussians that the options keep, and print why others are left out.
 
-    path: of their file, for messages. Raises :class:`UserError` if none are left.
+    Raises :class:`UserError` if none are left.
     """
     if args.seed_pos is not None and args.filter_cluster is None:
         raise UserError("--seed-pos: needs --filter-cluster")
-    found = find_kept(gaussians, args.crop, args.min_opacity, args.max_size)
-    lost = {name: np.count_nonzero(~kept) for name, kept in found.items()}
-    if found:
-        gaussians = take(gaussians, np.logical_and.reduce(list(found.values())))
+    gaussians = source.gaussians
+    kept = _find_kept(gaussians, args)
+    lost = {name: np.count_nonzero(~mask) for name, mask in kept.items()}
+    if kept:
+        gaussians = take(gaussians, np.logical_and.reduce(list(kept.values())))
     for name, option in (("floaters", args.filter_floaters), ("cluster", args.filter_cluster)):
         if option is not None and gaussians.num_gaussians:
             rule, is_given = option
             if not is_given:
                 rule = rule.scale_to(gaussians, extent_of(gaussians))
             if name == "floaters":
-                kept = find_non_floaters(gaussians, rule)
+                mask = find_non_floaters(gaussians, rule)
             else:
                 seed = None if args.seed_pos is None else args.seed_pos - np.array(gaussians.origin)
-                kept = find_cluster(gaussians, rule, seed)
-            lost[f"{name} (voxels of {rule.size:.3g})"] = np.count_nonzero(~kept)
-            gaussians = take(gaussians, kept)
+                mask = find_cluster(gaussians, rule, seed)
+            lost[f"{name} (voxels of {rule.size:.3g})"] = np.count_nonzero(~mask)
+            gaussians = take(gaussians, mask)
     if lost:
         reasons = ", ".join(f"{name} {count:,}" for name, count in lost.items())
         print(f"kept: {gaussians.num_gaussians:,}; left out by {reasons}", flush=True)
     if not gaussians.num_gaussians:
-        raise UserError(f"{path}: nothing is left; crop and filter less")
-    return gaussians
+        raise UserError(f"{source.path}: nothing is left; crop and filter less")
+    return replace(source, gaussians=gaussians)
 
 
-def reduce_to(
-    gaussians: Gaussians[np.ndarray], count: int, folder: Path | None, up: np.ndarray
-) -> Gaussians[np.ndarray]:
+def _find_kept(gaussians: Gaussians[np.ndarray], args: argparse.Namespace) -> dict[str, np.ndarray]:
+    """Return the mask (N,) of the Gaussians that each given criterion keeps."""
+    kept = {}
+    if args.crop is not None:
+        corners = np.reshape(args.crop, (2, 3))
+        means = gaussians.means.astype(np.float64) + gaussians.origin
+        inside = (means >= corners.min(axis=0)) & (means <= corners.max(axis=0))
+        kept["box"] = inside.all(axis=1)
+    if args.min_opacity is not None:
+        kept["opacity"] = gaussians.opacities >= args.min_opacity
+    if args.max_size is not None:
+        kept["size"] = gaussians.scales.max(axis=1) <= args.max_size
+    return kept
+
+
+def reduce_to(source: ExportSource, count: int, up: np.ndarray) -> ExportSource:
     """Return at most ``count`` Gaussians that look alike from the training cameras of a fit.
 
-    folder: of the fit; None: from cameras around the Gaussians, whose axis is ``up`` (3,), world.
+    Without a fit, from cameras around the Gaussians, whose axis is ``up`` (3,), world.
     """
     from drgs.export.decimation import SIDE_PX, VIEWS_PER_RING, decimate
 
-    if (before := gaussians.num_gaussians) <= count:
-        return gaussians
-    settings = ModelConfig(near=near_plane_of(gaussians)).with_3dgs_defaults()
-    background, views, where = GREY, None, "around the model"
-    if folder is not None:
-        config = load_run_config(folder)
-        settings = settings.model_copy(update={"near": config.model.near})
-        background, views = config.data.background_rgb, training_cameras(folder, gaussians.origin)
-    if views is not None:
-        where = "of the fit"
-    else:
-        views = rings_around(gaussians, up, VIEWS_PER_RING, SIDE_PX)
-    settings = settings.model_copy(update=gaussians.rendered_with or {})
+    if (before := source.gaussians.num_gaussians) <= count:
+        return source
+    background = GREY if source.config is None else source.config.data.background_rgb
+    views = source.views(up, VIEWS_PER_RING, SIDE_PX)
+    where = "around the model" if source.cameras is None else "of the fit"
     print(f"decimated: {before:,} to {count:,}, by {len(views)} views {where}", flush=True)
     with execution_settings(None, debug=False):
-        return decimate(gaussians, count, views, settings, background)
+        gaussians = decimate(source.gaussians, count, views, source.settings, background)
+    return replace(source, gaussians=gaussians)

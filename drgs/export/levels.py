@@ -71,30 +71,30 @@ def _node(
     levels: Sequence[_Level], members: Sequence[np.ndarray], names: list[str]
 ) -> Mapping[str, object]:
     """Return a node of the tree; members: indices (M,) of each level; names: of files, extended."""
-    means = np.concatenate([part.means[own] for part, own in zip(levels, members, strict=True)])
+    means = np.concatenate([part.means[rows] for part, rows in zip(levels, members, strict=True)])
     low, high = means.min(axis=0), means.max(axis=0)
     axis = int(np.argmax(high - low))
     above = means[means[:, axis] > low[axis], axis]
     boxes = np.concatenate(
-        [part.boxes[:, own] for part, own in zip(levels, members, strict=True)], axis=1
+        [part.boxes[:, rows] for part, rows in zip(levels, members, strict=True)], axis=1
     )
     bound = {"min": boxes[0].min(axis=0).tolist(), "max": boxes[1].max(axis=0).tolist()}
     if len(means) > LEAF_SIZE and len(above):
         middle = max(np.median(means[:, axis]), above.min())
-        left = [part.means[own, axis] < middle for part, own in zip(levels, members, strict=True)]
+        left = [part.means[rows, axis] < middle for part, rows in zip(levels, members, strict=True)]
         halves = (
-            [own[is_in] for own, is_in in zip(members, side, strict=True)]
+            [rows[is_in] for rows, is_in in zip(members, side, strict=True)]
             for side in (left, [~is_left for is_left in left])
         )
         return {"bound": bound, "children": [_node(levels, half, names) for half in halves]}
     lods = {}
-    for number, (part, own) in enumerate(zip(levels, members, strict=True)):
-        if len(own):
+    for number, (part, rows) in enumerate(zip(levels, members, strict=True)):
+        if len(rows):
             if not part.files or sum(map(len, part.files[-1])) >= FILE_SIZE:
                 part.files.append([])
                 names.append(f"{number}_{len(part.files) - 1}/{META}")
             file = names.index(f"{number}_{len(part.files) - 1}/{META}")
             offset = sum(map(len, part.files[-1]))
-            lods[str(number)] = {"file": file, "offset": offset, "count": len(own)}
-            part.files[-1].append(own[morton_order(part.means[own])])
+            lods[str(number)] = {"file": file, "offset": offset, "count": len(rows)}
+            part.files[-1].append(rows[morton_order(part.means[rows])])
     return {"bound": bound, "lods": lods}

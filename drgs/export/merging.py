@@ -6,13 +6,12 @@ neighbours. The cost is in closed form here instead of by sampling.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from drgs.export.selection import take
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
 NUM_NEIGHBOURS = 12
@@ -68,6 +67,14 @@ def merge_down(gaussians: Gaussians[np.ndarray], count: int) -> Gaussians[np.nda
     return replace(kept, **joined)
 
 
+def take(gaussians: Gaussians[np.ndarray], rows: np.ndarray) -> Gaussians[np.ndarray]:
+    """Return some of the Gaussians; rows: indices, or a mask (N,)."""
+    values = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
+    arrays = {name: v[rows] for name, v in values.items() if isinstance(v, np.ndarray)}
+    features = gaussians.features and {k: v[rows] for k, v in gaussians.features.items()}
+    return replace(gaussians, **arrays, features=features)
+
+
 def shapes_of(gaussians: Gaussians[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return float64 standard deviations (N, 3) and rotations (N, 3, 3), preceded by a mask (N,).
 
@@ -89,8 +96,8 @@ def _neighbours(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pairs a < b of nearest neighbours, each once, in order."""
     count = min(NUM_NEIGHBOURS + 1, len(means))
     near = KDTree(means).query(means, k=count)[1].reshape(len(means), count)
-    own = np.arange(len(means))[:, None]
-    pair = np.minimum(near, own) * len(means) + np.maximum(near, own)
+    index = np.arange(len(means))[:, None]
+    pair = np.minimum(near, index) * len(means) + np.maximum(near, index)
     a, b = np.divmod(np.unique(pair), len(means))
     return a[a < b], b[a < b]
 
@@ -114,11 +121,11 @@ def _disjoint_pairs(a: np.ndarray, b: np.ndarray, cost: np.ndarray, count: int) 
 
 def _squared_differences(values: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the sums (M,) of squared differences of pairs of rows, some pairs at a time."""
-    found = np.empty(len(a))
+    sums = np.empty(len(a))
     for start in range(0, len(a), PAIRS_AT_ONCE):
         part = slice(start, start + PAIRS_AT_ONCE)
-        found[part] = np.square(values[a[part]] - values[b[part]]).sum(axis=(1, 2))
-    return found
+        sums[part] = np.square(values[a[part]] - values[b[part]]).sum(axis=(1, 2))
+    return sums
 
 
 def _mix(values: np.ndarray, a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:

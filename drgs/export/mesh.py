@@ -143,9 +143,9 @@ def encode_glb(mesh: Trimesh, origin: Origin) -> bytes:
     mesh.vertices = mesh.vertices @ Z_TO_Y.T
     c = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     mesh.visual.vertex_colors = np.rint(255 * c).astype(np.uint8)
-    scene, place = mesh.scene(), np.eye(4)
-    place[:3, 3] = Z_TO_Y @ origin
-    scene.apply_transform(place)
+    scene, to_world = mesh.scene(), np.eye(4)
+    to_world[:3, 3] = Z_TO_Y @ origin
+    scene.apply_transform(to_world)
     return scene.export(file_type="glb", tree_postprocessor=make_unlit)
 
 
@@ -191,19 +191,19 @@ def fuse(
         size = view.width, view.height
         camera = Camera.create(mi.Float, rotation, view.center, view.K, *size, near=0.0)
         position = camera.rotation @ (centers - camera.center)
-        seen = position.z > 0
-        position.z = dr.select(seen, position.z, 1)
-        place = dr.floor(camera.lens.project_point(camera, position))
-        seen &= (place.x >= 0) & (place.x < view.width) & (place.y >= 0) & (place.y < view.height)
-        pixel = mi.UInt32(place.y) * view.width + mi.UInt32(place.x)
-        depth = dr.gather(mi.Float, mi.Float(image.depth.ravel()), pixel, seen)
+        visible = position.z > 0
+        position.z = dr.select(visible, position.z, 1)
+        film = dr.floor(camera.lens.project_point(camera, position))
+        visible &= (film.x >= 0) & (film.x < view.width) & (film.y >= 0) & (film.y < view.height)
+        pixel = mi.UInt32(film.y) * view.width + mi.UInt32(film.x)
+        depth = dr.gather(mi.Float, mi.Float(image.depth.ravel()), pixel, visible)
         distance = (depth - position.z) / truncation
-        seen &= (distance > -1) & dr.isfinite(distance)
-        near = seen & (distance < 1)
-        found = dr.gather(t.Array3f, mi.Float(image.colors.ravel()), pixel, near)
-        total += dr.select(seen, dr.minimum(distance, 1), 0)
-        weight += dr.select(seen, 1, 0)
-        color += dr.select(near, found, 0)
+        visible &= (distance > -1) & dr.isfinite(distance)
+        near = visible & (distance < 1)
+        shade = dr.gather(t.Array3f, mi.Float(image.colors.ravel()), pixel, near)
+        total += dr.select(visible, dr.minimum(distance, 1), 0)
+        weight += dr.select(visible, 1, 0)
+        color += dr.select(near, shade, 0)
         colored += dr.select(near, 1, 0)
         dr.eval(total, weight, color, colored)
     mean, shown = total / dr.maximum(weight, 1), 255 * color / dr.maximum(colored, 1)

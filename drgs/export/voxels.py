@@ -104,20 +104,20 @@ class Voxels:
         """
         totals = self.counts[rows].prod(axis=1).astype(np.int64)
         part = (np.cumsum(totals) - totals) // VISITS_AT_ONCE
-        for own in np.split(rows, np.flatnonzero(np.diff(part)) + 1):
-            yield from self._visit_part(own, at_center)
+        for chunk in np.split(rows, np.flatnonzero(np.diff(part)) + 1):
+            yield from self._visit_part(chunk, at_center)
 
     def _visit_part(self, rows: np.ndarray, at_center: bool) -> Iterator[tuple[np.ndarray, ...]]:
         counts = self.counts[rows].astype(np.int64)
         totals = counts.prod(axis=1)
         ends = np.cumsum(totals)
         for start in range(0, int(totals.sum()), VISITS_AT_ONCE):
-            place = np.arange(start, min(start + VISITS_AT_ONCE, ends[-1]))
-            of = np.searchsorted(ends, place, side="right")
-            place -= (ends - totals)[of]
-            x, y, _ = counts[of].T
-            local = np.stack([place % x, place // x % y, place // (x * y)], axis=1)
-            row = rows[of]
+            visit = np.arange(start, min(start + VISITS_AT_ONCE, ends[-1]))
+            owner = np.searchsorted(ends, visit, side="right")
+            visit -= (ends - totals)[owner]
+            x, y, _ = counts[owner].T
+            local = np.stack([visit % x, visit // x % y, visit // (x * y)], axis=1)
+            row = rows[owner]
             voxel, mean = self.first[row] + local, self.means[row]
             low = voxel * self.size
             point = low + self.size / 2 if at_center else np.clip(mean, low, low + self.size)
@@ -143,13 +143,14 @@ class Voxels:
 
         Or that contribute at least ``least`` at the centers of ``needed`` (N,) of them (None: 1).
         """
-        found = _contains(solid, self.centers)
-        hits = np.zeros(len(found), np.int64)
-        for voxel, row, value in self.visit(np.flatnonzero(~found & ~self.is_wide), at_center=True):
+        contributes = _contains(solid, self.centers)
+        hits = np.zeros(len(contributes), np.int64)
+        others = np.flatnonzero(~contributes & ~self.is_wide)
+        for voxel, row, value in self.visit(others, at_center=True):
             is_hit = value >= least
             is_hit[is_hit] = _contains(solid, voxel[is_hit])
             hits += np.bincount(row[is_hit], minlength=len(hits))
-        return found | (hits >= (1 if needed is None else needed))
+        return contributes | (hits >= (1 if needed is None else needed))
 
 
 def find_non_floaters(gaussians: Gaussians[np.ndarray], rule: VoxelRule) -> np.ndarray:
@@ -174,18 +175,19 @@ def find_cluster(
         return np.zeros(gaussians.num_gaussians, bool)
     ends = []
     for axis in range(3):
-        place = np.searchsorted(solid, solid + (1 << axis * KEY_BITS))
-        place[place == len(solid)] = 0
-        start = np.flatnonzero(solid[place] == solid + (1 << axis * KEY_BITS))
-        ends.append((start, place[start]))
+        neighbour = np.searchsorted(solid, solid + (1 << axis * KEY_BITS))
+        neighbour[neighbour == len(solid)] = 0
+        start = np.flatnonzero(solid[neighbour] == solid + (1 << axis * KEY_BITS))
+        ends.append((start, neighbour[start]))
     a, b = (np.concatenate(each) for each in zip(*ends, strict=True))
     edges = coo_matrix((np.ones(len(a), bool), (a, b)), (len(solid), len(solid)))
     label = connected_components(edges, directed=False)[1]
     number = np.stack([solid >> axis * KEY_BITS & MAX_VOXELS - 1 for axis in range(3)], axis=1)
     number = number + voxels.origin
     if seed is None:
-        place = np.minimum(np.searchsorted(solid, voxels.centers), len(solid) - 1)
-        chosen = np.argmax(np.bincount(label[place[solid[place] == voxels.centers]], minlength=1))
+        nearest = np.minimum(np.searchsorted(solid, voxels.centers), len(solid) - 1)
+        is_solid = solid[nearest] == voxels.centers
+        chosen = np.argmax(np.bincount(label[nearest[is_solid]], minlength=1))
     else:
         centers = (number + 0.5) * rule.size
         chosen = label[np.argmin(np.square(centers - seed).sum(axis=1))]
@@ -201,8 +203,8 @@ def _keys(numbers: np.ndarray) -> np.ndarray:
     return x + (y << KEY_BITS) + (z << 2 * KEY_BITS)
 
 
-def _contains(keys: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Return whether each of ``found`` is among the sorted ``keys``."""
+def _contains(keys: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return whether each of ``wanted`` is among the sorted ``keys``."""
     if not len(keys):
-        return np.zeros(len(found), bool)
-    return keys[np.minimum(np.searchsorted(keys, found), len(keys) - 1)] == found
+        return np.zeros(len(wanted), bool)
+    return keys[np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)] == wanted

@@ -100,11 +100,6 @@ def _add_viewing(parser: CommandParser) -> None:
         help="show the running fit on a web page, with buttons to pause and end it (extra: viewer)",
     )
     group.add_argument(
-        "--view-address",
-        metavar="ADDRESS",
-        help="address of the page (default: 127.0.0.1, reachable from this machine only)",
-    )
-    group.add_argument(
         "--view-port",
         type=bounded_int(1, MAX_PORT),
         metavar="N",
@@ -187,21 +182,19 @@ def add_observers(
         trainer = session.trainer
         viewer, session.criterion = watch(server, trainer, trainer.dataset, session.criterion)
         session.observers.append(viewer)
-        print(f"look on at {url(server)}", flush=True)
+        print(f"live view: {url(server)}", flush=True)
 
 
 def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer | None]:
     """Return the server of ``--view``'s page; None without it."""
     if not args.view:
-        for name in ("address", "port"):
-            if getattr(args, f"view_{name}") is not None:
-                raise UserError(f"--view-{name}: needs --view")
+        if args.view_port is not None:
+            raise UserError("--view-port: needs --view")
         return nullcontext()
     require_module("viser", "viewer", "--view")
-    from drgs.live_page.server import ADDRESS, run_server
+    from drgs.live_page.server import run_server
 
-    options = ("--view-address", "--view-port")
-    return run_server(args.view_address or ADDRESS, args.view_port, options)
+    return run_server(args.view_port, "--view-port")
 
 
 def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:

@@ -108,7 +108,7 @@ def write_results(
     history: FitHistory,
     metrics: FitMetrics,
 ) -> None:
-    """Write ``curves.png``, ``orbit.webp`` and ``.gif``, ``viewer.html``, ``report.html``.
+    """Write ``curves.png``, ``orbit.webp``, ``viewer.html``, ``report.html``.
 
     scores: of the test views, in order.
     """

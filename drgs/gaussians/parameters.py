@@ -68,7 +68,7 @@ class Gaussians(Generic[Tensor]):
         gaussians = Gaussians(
             **arrays, features=None, rendered_with=rendered_with or None, origin=origin
         )
-        return gaussians._rotate_harmonics(Z_TO_Y.T) if up == "y" else gaussians
+        return gaussians._rotate(Z_TO_Y.T) if up == "y" else gaussians
 
     def save(self, path: str | Path) -> None:
         """Write a file, atomically, in the format that its suffix names: see ``drgs.io.formats``.
@@ -115,7 +115,7 @@ class Gaussians(Generic[Tensor]):
         if lost:
             note = f"the format {name} has no room for {', '.join(lost)}: left out"
             warnings.warn(UserNote(note), stacklevel=2)
-        host = host._rotate_harmonics(Z_TO_Y) if chosen.up == "y" else host
+        host = host._rotate(Z_TO_Y) if chosen.up == "y" else host
         if self.origin != WORLD:
             values |= dict(zip(ORIGIN, host.origin, strict=True))
         return {n: getattr(host, n) for n in host._names}, values
@@ -211,9 +211,7 @@ class Gaussians(Generic[Tensor]):
         tensors = {name: upload(getattr(self, name)) for name in self._names}
         return cast("Gaussians[TensorXf]", replace(self, **tensors, features=features))
 
-    def _rotate_harmonics(
-        self: Gaussians[np.ndarray], rotation: np.ndarray
-    ) -> Gaussians[np.ndarray]:
+    def _rotate(self: Gaussians[np.ndarray], rotation: np.ndarray) -> Gaussians[np.ndarray]:
         from drgs.gaussians.rotation import rotate_gaussians, to_float32
 
         parts = rotate_gaussians(self.means, self.quats, self.shN, rotation)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from typing_extensions import override
@@ -12,7 +12,6 @@ from typing_extensions import override
 from drgs.cameras.viewpoints import Viewpoint, focus_of, is_panorama
 from drgs.config.schema import InitConfig
 from drgs.core.errors import UserError
-from drgs.datasets.film import to_camera, to_film
 from drgs.datasets.types import Dataset
 
 MIN_DISTANCE = 0.25  # of starting points to cameras, in distances to the focus
@@ -31,10 +30,7 @@ MIN_FACING_SHARE = 0.5  # of the cameras, which must look at the points of a sta
 
 CENTRAL_SHARE = 0.5  # of an image's width and height: its middle, at which a camera looks
 
-MIN_COVERED_SHARE = 0.005  # of an image (the median), which a box must cover
-
-NUM_SAMPLES, NUM_CELLS = 2000, 32
-"""Points that stand for a box, and the cells of an image, in each direction, that they cover."""
+NUM_SAMPLES = 2000  # points that stand for a box
 
 MAX_CLOUD_POINTS = 20_000  # points of a cloud that stand for all of it, which would take long
 
@@ -78,9 +74,9 @@ def start_box_of(init: InitConfig, dataset: Dataset) -> Box | None:
         focus, distance = focus_of(dataset.train)
     except UserError:
         return reference
-    seen = distance * _half_width(dataset.train)
+    visible_width = distance * _half_width(dataset.train)
     is_near = np.abs(focus - reference.center).max() <= reference.half_extent
-    if is_near and FILL_RANGE[0] <= reference.half_extent / seen <= FILL_RANGE[1]:
+    if is_near and FILL_RANGE[0] <= reference.half_extent / visible_width <= FILL_RANGE[1]:
         return reference
     return focus_box(dataset.train)
 
@@ -109,12 +105,12 @@ def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Genera
     kept = np.empty((0, 3))
     for _ in range(MAX_BATCHES):
         points = focus + distance * _near_and_far(count, rng)
-        seen, clear = np.zeros(count, bool), np.ones(count, bool)
+        visible, clear = np.zeros(count, bool), np.ones(count, bool)
         for view in views:
             offsets = points - view.center
-            seen |= _in_image(points, view)
+            visible |= _in_image(points, view)
             clear &= np.einsum("ni,ni->n", offsets, offsets) >= (MIN_DISTANCE * distance) ** 2
-        kept = np.concatenate([kept, points[seen & clear]])
+        kept = np.concatenate([kept, points[visible & clear]])
         if len(kept) >= count:
             return kept[:count]
     raise UserError(
@@ -163,31 +159,17 @@ def focus_text(dataset: Dataset) -> str:
 
 
 def check_box(box: Box, dataset: Dataset) -> None:
-    """Raise :class:`UserError` for a box that most cameras do not look into, or hardly see."""
+    """Raise :class:`UserError` for a box that most cameras do not look into."""
     points, views = box.points(NUM_SAMPLES, np.random.default_rng(0)), dataset.train
     looking = num_views_facing(points, views)
-    covered = float(np.median([_coverage(points, view) for view in views]))
-    if looking < MIN_FACING_SHARE * len(views):
-        reason = f"only {looking} of {len(views)} have it in the middle of their images"
-    elif covered < MIN_COVERED_SHARE:
-        reason = f"it covers only {100 * covered:.2g} % of an image (the median)"
-    else:
+    if looking >= MIN_FACING_SHARE * len(views):
         return
     in_world = Box(box.center + dataset.origin, box.half_extent)
     raise UserError(
         f"init.half_extent: the start box {in_world} must be what the cameras look at"
-        f"{focus_text(dataset)}, but {reason}; set init.half_extent=null, and it follows "
-        "from them"
+        f"{focus_text(dataset)}, but only {looking} of {len(views)} have it in the middle of their "
+        "images; set init.half_extent=null, and it follows from them"
     )
-
-
-def _coverage(points: np.ndarray, view: Viewpoint) -> float:
-    """Return the share of an image's cells that contain points; lenses are taken for pinholes."""
-    seen = points[_in_image(points, view)]
-    shown_by = view if is_panorama(view) else replace(view, lens=None)
-    u, v, _ = to_film(shown_by, to_camera(view, list(seen.T)))
-    cells = np.floor(NUM_CELLS * np.stack([u / view.width, v / view.height]))
-    return np.unique(cells, axis=1).shape[1] / NUM_CELLS**2
 
 
 def format_point(point: np.ndarray, scale: float) -> str:

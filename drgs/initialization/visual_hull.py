@@ -184,12 +184,12 @@ def _surface(silhouettes: Sequence[Silhouette], cubes: Cubes, levels: int, enoug
 
 def _points_in(silhouettes: Sequence[Silhouette], cubes: Cubes, seed: int) -> np.ndarray:
     """Return points (M, 3) of the hull near its surface, at most one in each eighth of a cube."""
-    random, found = np.random.Generator(np.random.Philox(key=seed)), [np.zeros((0, 3))]
+    random, kept = np.random.Generator(np.random.Philox(key=seed)), [np.zeros((0, 3))]
     for some in _chunks(np.arange(len(cubes))):
         eighths = cubes.select(some).divide()
         points = eighths.centers() + eighths.edge * (random.random((len(eighths), 3)) - 0.5)
-        found.append(points[_shown_by_all(silhouettes, points, 0.0)])
-    inside = np.concatenate(found)
+        kept.append(points[_shown_by_all(silhouettes, points, 0.0)])
+    inside = np.concatenate(kept)
     thin = cubes
     if len(inside):
         with denormals_kept():
@@ -215,7 +215,7 @@ def _shown_by_all(
 ) -> np.ndarray:
     """Return which (N,) cubes, points if edge is 0, no image shows empty and enough images show."""
     columns = [np.ascontiguousarray(c) for c in centers.T]
-    rows, seen = np.arange(len(centers)), np.zeros(len(centers), np.int32)
+    rows, num_views = np.arange(len(centers)), np.zeros(len(centers), np.int32)
     for silhouette in silhouettes:
         kept = [rows[:0]]
         for some in _chunks(rows):
@@ -224,11 +224,11 @@ def _shown_by_all(
                 shown, empty = area > 0, is_whole & (opaque == 0)
             else:
                 shown, empty = _classify_points(silhouette, columns, some)
-            seen[some] += shown
+            num_views[some] += shown
             kept.append(some[~empty])
         rows = np.concatenate(kept)
     result = np.zeros(len(centers), bool)
-    result[rows] = seen[rows] >= MIN_SEEN_SHARE * len(silhouettes)
+    result[rows] = num_views[rows] >= MIN_SEEN_SHARE * len(silhouettes)
     return result
 
 
@@ -256,8 +256,8 @@ def _classify_points(
     u, v, depth = to_film(view, to_camera(view, [c[rows] for c in points], np.float32))
     u, v = np.floor(u / silhouette.scale), np.floor(v / silhouette.scale)
     shown = (depth > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    place = np.where(shown, v * width + u, 0).astype(np.int64)
-    return shown, shown & ~silhouette.solid.ravel()[place]
+    pixel = np.where(shown, v * width + u, 0).astype(np.int64)
+    return shown, shown & ~silhouette.solid.ravel()[pixel]
 
 
 def _opaque_pixels(
@@ -273,23 +273,23 @@ def _opaque_pixels(
     u, v, depth = to_film(view, position)
     half_u, half_v = np.zeros_like(u), np.zeros_like(v)
     reach = 0.5 * math.sqrt(3) * edge
-    seen = depth > 2 * reach
+    shown = depth > 2 * reach
     for step in (0.5 * edge * view.camera_to_world[:3, :3]).tolist():
         moved = to_film(view, [p + s for p, s in zip(position, step, strict=True)])
         half_u += np.abs(moved[0] - u)
         half_v += np.abs(moved[1] - v)
-        seen &= moved[2] > 0
-    stretch = (depth + reach) / np.where(seen, depth - reach, 1)
+        shown &= moved[2] > 0
+    stretch = (depth + reach) / np.where(shown, depth - reach, 1)
     half_u *= stretch
     half_v *= stretch
     stride, flat = width + 1, silhouette.table.ravel()
-    whole = seen
+    whole = shown
     bounds = []
     for place, half, size in ((u, half_u, width), (v, half_v, height)):
         first = np.floor((place - half) / silhouette.scale)
         last = np.floor((place + half) / silhouette.scale) + 1
         whole = whole & (first >= 0) & (last <= size)
-        bounds += [np.where(seen, np.clip(b, 0, size), 0).astype(np.int32) for b in (first, last)]
+        bounds += [np.where(shown, np.clip(b, 0, size), 0).astype(np.int32) for b in (first, last)]
     left, right, top, bottom = bounds
     area = (right - left) * (bottom - top)
     top *= stride

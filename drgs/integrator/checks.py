@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.core.errors import PluginError, UnsupportedError
-from drgs.core.memory import MAX_LANES, UNASKED_BYTES, available_memory, too_large_reason
+from drgs.core.memory import MAX_LANES, UNCHECKED_BYTES, available_memory, too_large_reason
 from drgs.gaussians.parameters import Gaussians
 
 MAX_SAMPLES = 4096  # samples of a pixel times poses of motion blur; a frame takes 0.15 MB at least
@@ -108,7 +108,7 @@ def check_image(film: mi.Film, spp: int, poses: int, num_aovs: int, nested_spp: 
     if why is not None:
         raise PluginError(f"splats: {why}")
     samples, most = width * height * nested_spp, MAX_LANES
-    if samples * NESTED_SAMPLE_BYTES > UNASKED_BYTES:
+    if samples * NESTED_SAMPLE_BYTES > UNCHECKED_BYTES:
         most = min(most, available_memory() // NESTED_SAMPLE_BYTES)
     if samples > most:
         raise PluginError(

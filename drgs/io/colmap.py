@@ -317,47 +317,24 @@ def _take_point(file: _BinaryFile) -> tuple:
 
 def _text_records(path: Path, parse: Callable[[str], tuple], form: str) -> Iterator[tuple]:
     text = read_text(path, "file", MAX_FILE_BYTES, TEXT_MEMORY_RATIO)
-    lines = enumerate(text.split("\n"), 1)
-    for number, line in _without_observations(path, lines) if path.stem == "images" else lines:
-        if _is_record(line):
-            place = Place(path, "line", number)
-            try:
-                record = parse(line)
-            except ValueError:
-                raise UserError(f"{place}: {form} was expected, got {one_line(line, 60)}") from None
-            yield place, *record
-
-
-def _is_record(line: str) -> bool:
-    return line.strip()[:1] not in ("", "#")
-
-
-def _without_observations(
-    path: Path, lines: Iterable[tuple[int, str]]
-) -> Iterator[tuple[int, str]]:
-    """Drop the second line of each image, which may be empty; some programs write none."""
     follows_image = False
-    for number, line in lines:
-        if not follows_image or _is_image(line):
-            follows_image = _is_record(line)
-            yield number, line
-        elif len(line.split()) % 3:
-            raise UserError(
-                f"{Place(path, 'line', number)}: observations (X Y POINT3D_ID of each point) were "
-                "expected; each image has two lines, of which the second may be empty"
-            )
-        else:
+    for number, line in enumerate(text.split("\n"), 1):
+        # An image's second line may be empty, or, of some programs, missing.
+        if line.strip()[:1] in ("", "#") or (follows_image and _is_observations(line)):
             follows_image = False
+            continue
+        follows_image, place = path.stem == "images", Place(path, "line", number)
+        try:
+            record = parse(line)
+        except ValueError:
+            raise UserError(f"{place}: {form} was expected, got {one_line(line, 60)}") from None
+        yield place, *record
 
 
-def _is_image(line: str) -> bool:
-    """Return whether a line is as long as an image's first and ends in a name, not a number."""
+def _is_observations(line: str) -> bool:
+    """Return whether a line may be X Y POINT3D_ID of some points, and not a photograph's name."""
     words = line.split()
-    try:
-        float(words[-1] if len(words) > 9 else "0")
-    except ValueError:
-        return True
-    return False
+    return len(words) % 3 == 0 and words[-1].lstrip("-").isdecimal()
 
 
 def _parse_camera(line: str) -> tuple:

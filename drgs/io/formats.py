@@ -133,9 +133,9 @@ def format_for(path: str | Path) -> Extension[type[FileFormat]] | None:
     Installed packages are imported only if no shipped format has such a suffix.
     """
     for formats in (_shipped_formats, FORMATS.installed_extensions):
-        found = [each for each in formats() if Path(path).name.lower().endswith(each.value.suffix)]
-        if found:
-            return max(found, key=lambda each: len(each.value.suffix))
+        known = [each for each in formats() if Path(path).name.lower().endswith(each.value.suffix)]
+        if known:
+            return max(known, key=lambda each: len(each.value.suffix))
     return None
 
 
@@ -195,7 +195,8 @@ def check(name: str, gaussians: Arrays) -> None:
     if not extension.value.allows_nonfinite:
         if not len(gaussians["means"]):
             raise UserError(f"the format {name} needs at least one Gaussian, got none")
-        _check_finite(gaussians, f"the format {name} holds finite numbers: ")
+        for field, values in gaussians.items():
+            check_range(f"the format {name}", field, values)
 
 
 def _check_arrays(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
@@ -209,18 +210,31 @@ def _check_arrays(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
             listed = " or ".join(map(str, SHAPES[name]))
             raise ValueError(f"{name}: {listed} per Gaussian expected, got {np.shape(values)}")
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused below
-        found = {name: np.asarray(values, np.float32) for name, values in arrays.items()}
-    _check_finite(found, f"{path}: numbers must be finite: ")
-    return found
+        arrays = {name: np.asarray(values, np.float32) for name, values in arrays.items()}
+    for name, values in arrays.items():
+        check_range(path, name, values)
+    return arrays
 
 
-def _check_finite(gaussians: Arrays, start: str) -> None:
-    for field, values in gaussians.items():
-        bad = np.argwhere(~np.isfinite(values))
-        if len(bad):
-            raise UserError(
-                f"{start}{field} of Gaussian {bad[0][0]} is {values[tuple(bad[0])]}; remove it"
-            )
+def check_range(
+    where: str | Path,
+    name: str,
+    values: np.ndarray,
+    least: float = -np.inf,
+    most: float = np.inf,
+) -> None:
+    """Raise :class:`UserError` for a value (N, ...) that is not finite, or out of range.
+
+    where, name: of the values, for the message.
+    """
+    bad = np.argwhere(~(np.isfinite(values) & (values >= least) & (values <= most)))
+    if len(bad):
+        limits = "finite" if least == -np.inf else f"at least {least:g}"
+        limits = limits if most == np.inf else f"from {least:g} to {most:g}"
+        raise UserError(
+            f"{where}: {name} of Gaussian {bad[0][0]:,} must be {limits}, got "
+            f"{values[tuple(bad[0])]}; correct or remove it"
+        )
 
 
 def pop_origin(path: str | Path, rendered_with: dict[str, Scalar]) -> Origin:

@@ -24,14 +24,24 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import AliasPath, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasPath, BaseModel, ConfigDict, Field
 from pydantic.alias_generators import to_camel
 from typing_extensions import override
 
+from drgs.config.section import parse_json, validate
 from drgs.core.errors import Place, UserError, one_line
 from drgs.core.files import read_bytes
 from drgs.core.origin import WORLD, Origin, recenter_means
-from drgs.io.formats import FORMATS, MAX_ORIGIN, ORIGIN, Arrays, FileFormat, Scalar, pop_origin
+from drgs.io.formats import (
+    FORMATS,
+    MAX_ORIGIN,
+    ORIGIN,
+    Arrays,
+    FileFormat,
+    Scalar,
+    check_range,
+    pop_origin,
+)
 from drgs.io.ply import STATEMENT
 from drgs.io.quantization import (
     colors_from_sh0,
@@ -62,8 +72,6 @@ POINTS = 0
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 """Types of components that splats may have, by number."""
-
-NOT_NEGATIVE = "linear, so not negative (drafts of the extension had logarithms)"
 
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # types of accessors, by number of components
 
@@ -100,8 +108,8 @@ class Glb(FileFormat):
             )
         require_scene_memory(path, document.accessor("POSITION").count, count, turned=True)
         means = document.values("POSITION", 3)
-        scales = document.values(f"{EXTENSION}:SCALE", 3, 0, expected=NOT_NEGATIVE)
-        opacities = document.values(f"{EXTENSION}:OPACITY", 1, 0, 1, "from 0 to 1")
+        scales = document.values(f"{EXTENSION}:SCALE", 3, 0)
+        opacities = document.values(f"{EXTENSION}:OPACITY", 1, 0, 1)
         harmonics = np.stack(
             [document.values(name, 3).astype(np.float32) for name in _harmonics(count)], axis=1
         )
@@ -208,8 +216,8 @@ def _document(
     }
 
 
-def _chunks(path: Path, content: bytes) -> tuple[bytes, bytes, int]:
-    """Return the JSON part, the binary part, and the byte at which that begins."""
+def _chunks(path: Path, content: bytes) -> tuple[bytes, bytes]:
+    """Return the JSON part and the binary part."""
     refused = UserError(
         f"{Place(path, 'byte', 0)}: must be a binary glTF 2.0 file of a JSON part, of at most "
         f"{MAX_JSON_BYTES:,} bytes, and a binary part; it is damaged, cut off or another file"
@@ -222,10 +230,10 @@ def _chunks(path: Path, content: bytes) -> tuple[bytes, bytes, int]:
     except struct.error:
         raise refused from None
     start = text + json_size + CHUNK.size
-    found = magic, version, length, json_kind, kind
-    if found != (MAGIC, VERSION, len(content), JSON, BINARY) or start + size > length:
+    header = magic, version, length, json_kind, kind
+    if header != (MAGIC, VERSION, len(content), JSON, BINARY) or start + size > length:
         raise refused
-    return content[text : text + json_size], content[start : start + size], start
+    return content[text : text + json_size], content[start : start + size]
 
 
 Index = Annotated[int, Field(ge=0, lt=2**32)]
@@ -305,7 +313,6 @@ class _Document:
     file: _File
     translation: tuple[float, float, float]  # of the splats, by their node and its parents
     binary: bytes
-    start: int  # byte of the file at which ``binary`` begins
 
     @property
     def rendered_with(self) -> dict[str, Scalar]:
@@ -332,7 +339,6 @@ class _Document:
         width: int,
         least: float = -np.inf,
         most: float = np.inf,
-        expected: str = "finite",
     ) -> np.ndarray:
         """Return an attribute (N, width) float64 of finite numbers from ``least`` to ``most``."""
         accessor = self.accessor(name)
@@ -354,57 +360,35 @@ class _Document:
             values = rows.astype(np.float64)
         if dtype.kind != "f" and accessor.normalized:
             values = np.maximum(values / np.iinfo(dtype).max, -1)
-        bad = np.argwhere(~((values >= least) & (values <= most) & np.isfinite(values)))
-        if len(bad):
-            raise UserError(
-                f"{Place(self.path, 'byte', self.start + first)}, row {bad[0][0]:,}: {name} must "
-                f"be {expected}, got {values[tuple(bad[0])]}"
-            )
+        check_range(self.path, name, values, least, most)
         return values
 
     def _item(self, key: str, items: list[object], index: int, kind: type[Part]) -> Part:
         if index >= len(items):
             raise UserError(f"{self.path}: {key}[{index}] must be there, got {len(items)} of them")
-        return validate_part(self.path, f"{key}[{index}].", kind, items[index])
+        return validate(kind, items[index], f"{self.path}: {key}[{index}].")
 
 
-def _read_document(path: Path, text: bytes, binary: bytes, start: int) -> _Document:
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: the JSON part is not valid: {one_line(error)}") from None
-    file = validate_part(path, "", _File, content)
-    found = [
+def _read_document(path: Path, text: bytes, binary: bytes) -> _Document:
+    file = validate(_File, parse_json(text, f"{path}: the JSON part: "), f"{path}: ")
+    splats = [
         (mesh, index)
         for mesh, each in enumerate(file.meshes)
         for index, primitive in enumerate(each.primitives)
         if isinstance(known := primitive.get("extensions"), dict) and EXTENSION in known
     ]
-    if len(found) != 1:
+    if len(splats) != 1:
         raise UserError(
-            f"{path}: must have one primitive with {EXTENSION}, got {len(found) or 'none'}"
+            f"{path}: must have one primitive with {EXTENSION}, got {len(splats) or 'none'}"
         )
-    mesh, index = found[0]
+    mesh, index = splats[0]
     place = f"meshes[{mesh}].primitives[{index}]"
-    primitive = validate_part(path, f"{place}.", _Primitive, file.meshes[mesh].primitives[index])
+    primitive = validate(_Primitive, file.meshes[mesh].primitives[index], f"{path}: {place}.")
     missing = [name for name in REQUIRED if name not in primitive.attributes]
     if missing:
         raise UserError(f"{path}: {place}: attributes {', '.join(missing)} are missing")
     translation = _translation(path, file.nodes, mesh)
-    return _Document(path, place, primitive, file, translation, binary, start)
-
-
-def validate_part(path: Path, place: str, kind: type[Part], content: object) -> Part:
-    """Return a part of a JSON document; place: its start, for messages; raise UserError."""
-    try:
-        return kind.model_validate(content)
-    except ValidationError as failed:
-        error = failed.errors(include_url=False)[0]
-        keys = ".".join(str(key) for key in error["loc"]) or "the JSON part"
-        raise UserError(
-            f"{path}: {one_line(place + keys, 200)}: {one_line(error['msg'], 200)}, got "
-            f"{one_line(repr(error['input']), 60)}; write the file otherwise"
-        ) from None
+    return _Document(path, place, primitive, file, translation, binary)
 
 
 def _translation(path: Path, nodes: list[_Node], mesh: int) -> tuple[float, float, float]:
@@ -413,10 +397,10 @@ def _translation(path: Path, nodes: list[_Node], mesh: int) -> tuple[float, floa
     if len(showing) > 1:
         raise UserError(f"{path}: the splats must be shown once, got {len(showing)} nodes")
     parents = {child: index for index, node in enumerate(nodes) for child in node.children}
-    seen, total = set(), (0.0, 0.0, 0.0)
-    while showing and showing[0] not in seen:
+    visited, total = set(), (0.0, 0.0, 0.0)
+    while showing and showing[0] not in visited:
         index = showing[0]
-        seen.add(index)
+        visited.add(index)
         moved = [n for n, same in IDENTITY.items() if getattr(nodes[index], n) != same]
         if moved:
             raise UserError(

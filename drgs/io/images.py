@@ -1,15 +1,14 @@
 """All images that drgs reads from files or writes to files.
 
 Read: 8 bits, with and without alpha, and grey of 16 bits; of colours of 16 bits, the upper 8.
-Written, whole or not at all: 8-bit PNG and WebP, animations as WebP and GIF, Mitsuba's bitmaps as
-EXR. Images are (H, W, C) in display space, rounded to 8 bits and clamped to [0, 1] here.
+Written, whole or not at all: 8-bit PNG and WebP, animations as WebP, Mitsuba's bitmaps as EXR.
+Images are (H, W, C) in display space, rounded to 8 bits and clamped to [0, 1] here.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageCms, ImageFile, PngImagePlugin, UnidentifiedImageError
 
 from drgs.core.errors import UserError, one_line
-from drgs.core.files import atomic_path, open_regular
+from drgs.core.files import atomic_path, open_regular, refuse_damage
 from drgs.core.memory import require_memory
 
 if TYPE_CHECKING:
@@ -55,7 +54,7 @@ MAX_WEBP_SIDE = 16_383  # px: the largest width and height that the format can e
 
 MAX_FRAMES_BYTES = 2 << 30  # all frames of an animation, which are held until it is written
 
-FRAME_MS = 70  # 60 frames turn once in 4.2 s; GIF has steps of 10 ms
+FRAME_MS = 70  # 60 frames turn once in 4.2 s
 
 WEBP_QUALITIES, WEBP_BYTES = (80, 60, 40, 20), 1_500_000
 """The first quality is used that keeps an animation within so many bytes, or else the last."""
@@ -67,10 +66,6 @@ pixels: a flat background."""
 LOSSLESS_STEP = 255 / 31
 """Levels of 255 between two values of a channel without loss: a smaller error than that of lossy
 coding, which halves the resolution of colours, and two thirds of the bytes."""
-
-GIF_WIDTH = 300  # px: a GIF needs about five times the bytes of a WebP of the same size
-
-NEAR_BACKGROUND = 8  # levels of 255: nearer colours of a GIF's palette become the background's
 
 
 # Reading: by Pillow itself, which reads an image's mode and size before decoding it
@@ -127,35 +122,10 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return np.fliplr(pixels) if orientation in (2, 3, 6, 7) else pixels
 
 
-def unused_content(path: Path) -> list[str]:
-    """Describe content of an image that :func:`read_pixels` does not use; from its header."""
+def colour_profile(path: Path) -> str:
+    """Return the name of the colour profile, which is not applied; "": sRGB's, or none."""
     with _open_image(path) as image:
-        found = []
-        if _bits(image) > BITS.get(image.mode, 8):
-            found.append(f"of {_bits(image)} bits a channel, of which 8 are used")
-        if profile := _colour_profile(image.info.get("icc_profile")):
-            found.append(f"with the colour profile {profile}, which is not applied")
-        # The other images of an MPO are smaller ones, or for bright displays.
-        if image.format != "MPO" and getattr(image, "n_frames", 1) > 1:
-            found.append("with several images each, of which the first is used")
-        return found
-
-
-def _bits(image: ImageFile.ImageFile) -> int:
-    """Return bits of a channel in the file; Pillow decodes colours to 8."""
-    if image.format == "TIFF":
-        return max(cast("TiffImageFile", image).tag_v2.get(ExifTags.Base.BitsPerSample, (8,)))
-    if image.format == "JPEG2000" or not image.tile:
-        return 8
-    args = image.tile[0].args
-    if image.format == "PPM" and isinstance(args, tuple) and isinstance(args[-1], int):
-        return args[-1].bit_length()
-    mode = args if isinstance(args, str) else str(args[0] if args else "")
-    return 16 if ";16" in mode else 8
-
-
-def _colour_profile(profile: bytes | None) -> str:
-    """Return the name of a profile of other colours than sRGB; "": there is none."""
+        profile = image.info.get("icc_profile")
     if not profile:
         return ""
     try:
@@ -231,22 +201,20 @@ def _check_supported(path: Path, image: Image.Image) -> None:
 @contextmanager
 def _open_image(path: Path) -> Iterator[ImageFile.ImageFile]:
     """Open an image without decoding it; errors within the block become the user's."""
-    try:
-        with open_regular(path, "image", MAX_BYTES) as file, Image.open(file) as image:
+    where = f"{path}: cannot read the image"
+    with open_regular(path, "image", MAX_BYTES) as file, refuse_damage(where):
+        try:
+            image = Image.open(file)
+        except UnidentifiedImageError:
+            raise UserError(
+                f"{where}: it is of no format that is read, such as PNG, JPEG, TIFF or WebP; "
+                "convert it"
+            ) from None
+        with image:
             yield image
-    except (UserError, MemoryError):
-        raise
-    except UnidentifiedImageError:
-        raise UserError(
-            f"{path}: cannot read the image: it is of no format that is read, such as PNG, JPEG, "
-            "TIFF or WebP; convert it"
-        ) from None
-    except Exception as error:  # Pillow raises many types for a broken file
-        reason = getattr(error, "strerror", None) or one_line(error) or type(error).__name__
-        raise UserError(f"{path}: cannot read the image: {reason}") from None
 
 
-# Writing: by imageio, but for the palette that all frames of a GIF share
+# Writing: by imageio
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
@@ -306,23 +274,15 @@ def check_animation(frames: int, width: int, height: int) -> None:
 
 
 def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
-    """Write ``path``, an animated WebP that loops, and beside it a GIF of at most 300 px width.
-
-    The GIF is for mail, slides and old viewers. frames: at least one, of one size,
-    in 0..1 or uint8.
-    """
-    large = np.stack([to_uint8(frame) for frame in frames])
-    with ThreadPoolExecutor(1) as pool:
-        writing = pool.submit(_write_gif, path.with_suffix(".gif"), large)
-        data = _encode_lossless(large)
-        if data is None:
-            for quality in WEBP_QUALITIES:
-                data = encode(large, "webp", quality=quality, method=3, duration=FRAME_MS, loop=0)
-                if len(data) <= WEBP_BYTES:
-                    break
-        assert data is not None, "there is at least one quality"
-        _write(path, data)
-        writing.result()
+    """Write an animated WebP that loops; frames: at least one, of one size, in 0..1 or uint8."""
+    stack = np.stack([to_uint8(frame) for frame in frames])
+    data = _encode_lossless(stack)
+    for quality in WEBP_QUALITIES if data is None else ():
+        data = encode(stack, "webp", quality=quality, method=3, duration=FRAME_MS, loop=0)
+        if len(data) <= WEBP_BYTES:
+            break
+    assert data is not None, "there is at least one quality"
+    _write(path, data)
 
 
 def _encode_lossless(frames: np.ndarray) -> bytes | None:
@@ -358,33 +318,6 @@ def _commonest_color(pixels: np.ndarray) -> tuple[np.ndarray, float]:
     most = numbers[np.argmax(counts)]
     color = np.array([most >> 16, most >> 8 & 255, most & 255], np.uint8)
     return color, float(counts.max() / counts.sum())
-
-
-def _write_gif(path: Path, large: np.ndarray) -> None:
-    frames = [Image.fromarray(frame) for frame in large]
-    if (width := large.shape[2]) > GIF_WIDTH:
-        size = GIF_WIDTH, max(1, round(large.shape[1] * GIF_WIDTH / width))
-        frames = [frame.resize(size, Image.Resampling.BOX) for frame in frames]
-    palette = _common_palette(frames)
-    first, *rest = [frame.quantize(palette=palette) for frame in frames]
-    options = {"append_images": rest, "duration": FRAME_MS, "loop": 0, "optimize": False}
-    with atomic_path(path) as temporary:
-        first.save(temporary, "GIF", save_all=True, **options)
-
-
-def _common_palette(frames: Sequence[Image.Image]) -> Image.Image:
-    """Return 256 colours for all frames; the commonest, the background, is kept exactly.
-
-    Pillow looks colours up in cells of 4 levels, so that any palette colour near the background's
-    would be taken for it: those are replaced by it.
-    """
-    strip = np.concatenate([np.asarray(frame) for frame in frames[:: len(frames) // 8 or 1]])
-    background, _ = _commonest_color(strip)
-    palette = Image.fromarray(strip).quantize(256, method=Image.Quantize.MEDIANCUT)
-    values = np.array(palette.getpalette(), np.int64).reshape(-1, 3)
-    values[np.abs(values - background).max(axis=1) <= NEAR_BACKGROUND] = background
-    palette.putpalette(values.ravel().tolist())
-    return palette
 
 
 def _write(path: Path, data: bytes) -> None:

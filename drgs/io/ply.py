@@ -28,16 +28,16 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, takewhile
 from pathlib import Path
-from typing import IO
+from typing import IO, NoReturn
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty
 from typing_extensions import override
 
 from drgs.core.errors import UserError, UserNote, format_names, one_line
-from drgs.core.files import open_regular
+from drgs.core.files import open_regular, refuse_damage
 from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD, recenter_means
 from drgs.io.formats import FORMATS, ORIGIN, Arrays, FileFormat, Scalar, pop_origin
@@ -198,24 +198,33 @@ def has_packed_vertices(path: str | Path) -> bool:
 def read_elements(
     path: str | Path, names: Collection[str]
 ) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
-    """Return rows of elements as structured arrays, and the values in the header's comments.
+    """Return elements as structured arrays, and the values in the header's comments.
 
-    Elements of ``names`` other than ``vertex`` may be missing; they must have no lists.
+    Elements of ``names`` other than ``vertex`` may be missing. What follows an element with lists,
+    such as faces, is not read.
 
-    Raises :class:`UserError` naming the file and what it lacks: it must be complete, and
-    elements must have numbers only.
+    Raises :class:`UserError` naming the file and what it lacks: it must be complete, and elements
+    of ``names`` must have numbers only.
     """
     with _open_after_header(path) as (file, header):
-        wanted = [each for each in header.elements if each.name in names]
-        size = sum(header.counts[each.name] * each.dtype().itemsize for each in wanted)
+        elements = list(takewhile(_has_numbers_only, header.elements))
+        size = sum(header.counts[each.name] * each.dtype().itemsize for each in elements)
         require_memory(path, MEMORY_RATIO * size, header.expected_rows)
-        rows = (_text_rows if header.text else _binary_rows)(path, file, header, names)
-        for name in ("vertex", *(each.name for each in wanted)):
-            if name not in rows or not len(rows[name]):
+        lines = io.TextIOWrapper(file, "ascii") if header.text else None
+        rows = {each.name: _read_rows(lines or file, header, each) for each in elements}
+        for name in ("vertex", *(name for name in names if name in header.counts)):
+            if not len(rows.get(name, ())):
                 raise UserError(
                     f"{path}: element {name} must have at least 1 row, no lists, and come before "
                     f"elements that have; the file has {header.expected_rows}"
                 )
+        rest = "" if len(elements) < len(header.elements) else (lines or file).read()
+        if num_left := len(rest.strip() if header.text else rest):
+            raise UserError(
+                f"{path}: the file must end after the rows that its header promises "
+                f"({header.expected_rows}), got {num_left:,} bytes more; correct the header's "
+                "counts, or get the file again"
+            )
         return rows, header.statements
 
 
@@ -238,14 +247,8 @@ class _Header:
 @contextmanager
 def _open_after_header(path: str | Path) -> Iterator[tuple[IO[bytes], _Header]]:
     """Open a file after its header; whatever fails in the block becomes a :class:`UserError`."""
-    try:
-        with open_regular(path) as file:
-            yield file, _read_header(path, file)
-    except (UserError, MemoryError):
-        raise
-    except Exception as error:  # plyfile and NumPy raise many types for a broken file
-        reason = one_line(error) or type(error).__name__
-        raise UserError(f"{path}: not a valid PLY file: {reason}") from None
+    with refuse_damage(f"{path}: not a valid PLY file"), open_regular(path) as file:
+        yield file, _read_header(path, file)
 
 
 def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
@@ -254,9 +257,8 @@ def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
     newline = next((n for n in (b"\r\n", b"\r") if content.startswith(b"ply" + n)), b"\n")
     header, end, _ = content.partition(newline + b"end_header" + newline)
     if not end:
-        raise UserError(
-            f"{path}: not a valid PLY file: the header must end with end_header within the first "
-            f"{MAX_HEADER_BYTES:,} bytes"
+        raise ValueError(
+            f"the header must end with end_header within the first {MAX_HEADER_BYTES:,} bytes"
         )
     size = file.seek(0, io.SEEK_END)
     file.seek(len(header) + len(end))
@@ -267,25 +269,53 @@ def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
             counts[name] = int(count)
             lines[index] = b"element %s 0" % name.encode()  # plyfile is to read no rows
             if not 0 <= counts[name] <= size:  # refused before memory is allocated
-                _refuse_end(path, name, counts[name], size)
+                _refuse_end(name, counts[name], size)
     ply = PlyData.read(io.BytesIO(b"\n".join([*lines, b"end_header", b""])))
     return _Header(ply.elements, counts, _statements(path, lines), ply.text, ply.byte_order, size)
 
 
+def _has_numbers_only(element: PlyElement) -> bool:
+    return not any(isinstance(each, PlyListProperty) for each in element.properties)
+
+
+def _read_rows(
+    file: IO[bytes] | io.TextIOWrapper, header: _Header, element: PlyElement
+) -> np.ndarray:
+    """Read the rows of an element from a binary file, or from the lines of a text."""
+    count, dtype = header.counts[element.name], element.dtype(header.byte_order)
+    if isinstance(file, io.TextIOWrapper):
+        with warnings.catch_warnings():  # of no rows, which are refused
+            warnings.simplefilter("ignore")
+            rows = np.loadtxt(islice(file, count), element.dtype(), comments=None, ndmin=1)
+    else:
+        num_left = (header.end - file.tell()) // max(1, dtype.itemsize)
+        rows = np.fromfile(file, dtype, min(count, num_left))
+    if len(rows) < count:
+        _refuse_end(element.name, count, len(rows))
+    return rows
+
+
+def _refuse_end(name: str, promised: int, got: int) -> NoReturn:
+    raise ValueError(
+        f"element {one_line(name, 60)} must have the {promised:,} rows that the header promises, "
+        f"got {got:,}: the file is cut off; get it again"
+    )
+
+
 def _statements(path: str | Path, lines: list[bytes]) -> dict[str, Scalar]:
-    found: dict[str, str] = {}
+    values: dict[str, str] = {}
     comments = [line.removeprefix(b"comment ") for line in lines if line.startswith(b"comment ")]
     texts = [comment.decode("ascii", "replace").strip() for comment in comments]
     for match in filter(None, map(STATEMENT.fullmatch, texts)):
         name, text = match.groups()
-        if found.setdefault(name, text) != text:
+        if values.setdefault(name, text) != text:
             raise UserError(
-                f"{path}: the header's comments must give {name} once, got {found[name]} and "
+                f"{path}: the header's comments must give {name} once, got {values[name]} and "
                 f"{text}; remove one of the lines"
             )
     if any(map(ANTIALIASED.fullmatch, texts)):
-        found.setdefault("antialiased", "true")
-    return {name: _scalar(text) for name, text in found.items()}
+        values.setdefault("antialiased", "true")
+    return {name: _scalar(text) for name, text in values.items()}
 
 
 def _scalar(text: str) -> Scalar:
@@ -297,65 +327,6 @@ def _scalar(text: str) -> Scalar:
         except ValueError:
             continue
     return text
-
-
-def _has_lists(element: PlyElement) -> bool:
-    return any(isinstance(each, PlyListProperty) for each in element.properties)
-
-
-def _binary_rows(
-    path: str | Path, file: IO[bytes], header: _Header, names: Collection[str]
-) -> dict[str, np.ndarray]:
-    """Read some elements of a binary file. What follows an element with lists is not read."""
-    rows = {}
-    for element in header.elements:
-        if _has_lists(element):  # where these end is not known
-            return rows
-        dtype, count = element.dtype(header.byte_order), header.counts[element.name]
-        width, here = max(1, dtype.itemsize), file.tell()
-        if here + count * width > header.end:
-            _refuse_end(path, element.name, count, (header.end - here) // width)
-        if element.name in names:
-            rows[element.name] = np.fromfile(file, dtype, count)
-        file.seek(here + count * width)
-    _check_end(path, header, header.end - file.tell())
-    return rows
-
-
-def _text_rows(
-    path: str | Path, file: IO[bytes], header: _Header, names: Collection[str]
-) -> dict[str, np.ndarray]:
-    """Read some elements of a text file, in which each row is a line."""
-    lines, rows = io.TextIOWrapper(file, "ascii"), {}
-    for element in header.elements:
-        count = header.counts[element.name]
-        if element.name in names and not _has_lists(element):
-            with warnings.catch_warnings():  # of no rows, which are refused
-                warnings.simplefilter("ignore")
-                found = np.loadtxt(islice(lines, count), element.dtype(), comments=None, ndmin=1)
-            rows[element.name], num = found, len(found)
-        else:
-            num = sum(1 for _ in islice(lines, count))
-        if num < count:
-            _refuse_end(path, element.name, count, num)
-    _check_end(path, header, sum(len(line) for line in lines if line.strip()))
-    return rows
-
-
-def _refuse_end(path: str | Path, name: str, promised: int, got: int) -> None:
-    raise UserError(
-        f"{path}: not a valid PLY file: element {one_line(name, 60)} must have the {promised:,} "
-        f"rows that the header promises, got {got:,}: the file is cut off; get it again"
-    )
-
-
-def _check_end(path: str | Path, header: _Header, num_left: int) -> None:
-    if num_left:
-        raise UserError(
-            f"{path}: the file must end after the rows that its header promises "
-            f"({header.expected_rows}), got {num_left:,} bytes more; correct the header's counts, "
-            "or get the file again"
-        )
 
 
 def _finite_logits(path: str | Path, logits: np.ndarray) -> np.ndarray:

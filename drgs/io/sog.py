@@ -23,8 +23,7 @@ import json
 import math
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -34,11 +33,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.cluster.vq import kmeans2
 from typing_extensions import override
 
+from drgs.config.section import parse_json, validate
 from drgs.core.errors import UserError, one_line
-from drgs.core.files import open_regular, read_bytes
+from drgs.core.files import open_regular, read_bytes, refuse_damage
 from drgs.core.memory import require_memory
 from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
-from drgs.io.glb import validate_part
 from drgs.io.quantization import (
     drop_largest_component,
     logits_from_opacities,
@@ -80,12 +79,8 @@ class Sog(FileFormat):
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         """Return Gaussians, and whether ``antialiased``; of an archive or beside a meta.json."""
-        text = _load(path, META)
-        try:
-            content = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise UserError(f"{path}: {META} is not valid JSON: {one_line(error)}") from None
-        meta = validate_part(path, f"{META}: ", _Meta, content)
+        where = f"{path}: {META}: "
+        meta = validate(_Meta, parse_json(_load(path, META), where), where)
         num, degree = meta.count, meta.shN.bands if meta.shN else 0
         require_scene_memory(path, num, (degree + 1) ** 2)
         low, high = (_pixels(path, n, num)[:, :3].astype(np.uint16) for n in meta.means.files)
@@ -225,25 +220,13 @@ class _Meta(_Part):
     antialias: bool = False
 
 
-@contextmanager
-def _refuse_damage(path: Path, name: str) -> Iterator[None]:
-    """Turn the many errors of zipfile, zlib and Pillow for a broken file into the user's."""
-    try:
-        yield
-    except (UserError, MemoryError):
-        raise
-    except Exception as error:
-        reason = one_line(error) or type(error).__name__
-        raise UserError(f"{path}: cannot read {one_line(name, 60)}: {reason}") from None
-
-
 def _load(path: Path, name: str) -> bytes:
     """Return a file of the archive, or beside its meta.json."""
     if path.name.lower() == META:
         return read_bytes(path if name == META else path.with_name(name), "file", MAX_BYTES)
     with (
         open_regular(path, "file", MAX_BYTES) as file,
-        _refuse_damage(path, name),
+        refuse_damage(f"{path}: cannot read {one_line(name, 60)}"),
         zipfile.ZipFile(file) as archive,
     ):
         require_memory(path, archive.getinfo(name).file_size, name)
@@ -254,7 +237,7 @@ def _pixels(path: Path, name: str, least: int, width: int | None = None) -> np.n
     """Return the first pixels (N, 4) uint8 of an image, row by row; width: None: any."""
     content, most = _load(path, name), 2 * least + MAX_PALETTE
     with (
-        _refuse_damage(path, name),
+        refuse_damage(f"{path}: cannot read {one_line(name, 60)}"),
         Image.open(io.BytesIO(content), formats=["WEBP", "PNG"]) as image,
     ):
         if not least <= image.width * image.height <= most or image.width != (width or image.width):
@@ -326,7 +309,7 @@ def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return rows, np.arange(len(rows))
     centers, cells = _kmeans(rows, CELLS)
     members = [np.flatnonzero(cells == cell) for cell in range(CELLS)]
-    sizes = np.array([len(own) for own in members])
+    sizes = np.array([len(member) for member in members])
     spread = np.array([np.square(rows[m] - c).sum() for m, c in zip(members, centers, strict=True)])
     shares = spread / max(spread.sum(), np.finfo(np.float32).tiny)
     counts = np.minimum(sizes, 1)
@@ -337,9 +320,9 @@ def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     entries, labels, num = [], np.empty(len(rows), np.intp), 0
     for each, count in zip(members, counts, strict=True):
         if count:
-            found, labels[each] = _kmeans(rows[each], count)
+            centroids, labels[each] = _kmeans(rows[each], count)
             labels[each] += num
-            entries.append(found)
+            entries.append(centroids)
             num += count
     return np.concatenate(entries), labels
 

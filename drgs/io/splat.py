@@ -16,7 +16,7 @@ from typing_extensions import override
 
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
-from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
+from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar, check_range
 from drgs.io.quantization import (
     colors_from_sh0,
     log_scales_from_scales,
@@ -54,16 +54,8 @@ class Splat(FileFormat):
             )
         rows = np.frombuffer(content, ROW)
         require_scene_memory(path, len(rows), 1)
-        for name, start, least in (("mean", 0, -MAX_NUMBER), ("scale", 12, 0)):
-            values = rows[name]
-            bad = np.argwhere(~((values >= least) & (values <= MAX_NUMBER)))
-            if len(bad):
-                row, axis = bad[0]
-                at = row * ROW.itemsize + start + 4 * axis
-                raise UserError(
-                    f"{Place(path, 'byte', at)}: a {name} must be from {least:g} to "
-                    f"{MAX_NUMBER:g}, got {values[row, axis]}; is it a .splat file?"
-                )
+        check_range(path, "mean", rows["mean"], -MAX_NUMBER, MAX_NUMBER)
+        check_range(path, "scale", rows["scale"], 0, MAX_NUMBER)
         arrays = {
             "means": rows["mean"],
             "quats": rows["quat"].astype(np.float64) / 128 - 1,

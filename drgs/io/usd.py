@@ -23,9 +23,19 @@ from typing_extensions import override
 
 from drgs.core.environment import require_module
 from drgs.core.errors import UserError, UserNote, one_line
+from drgs.core.files import refuse_damage
 from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD
-from drgs.io.formats import FORMATS, ORIGIN, UP, Arrays, FileFormat, Scalar, pop_origin
+from drgs.io.formats import (
+    FORMATS,
+    ORIGIN,
+    UP,
+    Arrays,
+    FileFormat,
+    Scalar,
+    check_range,
+    pop_origin,
+)
 from drgs.io.quantization import (
     log_scales_from_scales,
     logits_from_opacities,
@@ -56,13 +66,8 @@ class Usd(FileFormat):
         """Return the Gaussians of the only prim of this kind, its translation, and the axis up."""
         modules = _import_openusd("Gf", "Usd", "UsdGeom", "UsdVol")
         require_memory(path, 2 * path.stat().st_size, "the file")
-        try:
+        with refuse_damage(f"{path}: not a valid USD file"):
             return _read_stage(path, *modules)
-        except (UserError, MemoryError):
-            raise
-        except Exception as error:  # Tf.ErrorException: places in OpenUSD's code, and reasons
-            reason = one_line(str(error).rpartition(" : ")[2], 200)
-            raise UserError(f"{path}: not a valid USD file: {reason}") from None
 
     @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
@@ -174,12 +179,7 @@ def _read_attribute(
     if not len(rows) or num not in (None, len(rows)):
         expected = "at least one" if num is None else f"{num:,} of them"
         raise UserError(f"{place}: {name}: {expected} expected, got {len(rows):,}")
-    bad = np.argwhere(~((rows >= least) & (rows <= most)))
-    if len(bad):
-        raise UserError(
-            f"{place}: {name} of Gaussian {bad[0][0]} must be from {least:g} to {most:g}, got "
-            f"{rows[tuple(bad[0])]}"
-        )
+    check_range(place, name, rows, least, most)
     return rows
 
 

@@ -158,13 +158,13 @@ def _depth(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     image, seconds = scene.image(request, "depth:depth, alpha:alpha")
     depth, alpha = image[:, :, 3], image[:, :, 4]
     depth = depth / np.maximum(alpha, 1e-6)
-    seen = depth[alpha >= MIN_DEPTH_ALPHA]
-    if not len(seen):
+    depths = depth[alpha >= MIN_DEPTH_ALPHA]
+    if not len(depths):
         backdrop = np.full((*depth.shape, 3), BACKDROP_GRAY)
         return ViewerFrame(to_bytes(backdrop), seconds, "nothing is seen")
-    near, far = (float(end) for end in np.percentile(seen, DEPTH_RANGE))
-    place = np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
-    colors = colormaps["turbo"](place)[:, :, :3]
+    near, far = (float(end) for end in np.percentile(depths, DEPTH_RANGE))
+    position = np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
+    colors = colormaps["turbo"](position)[:, :, :3]
     return ViewerFrame(over_backdrop(colors, alpha), seconds, f"red {near:.3g} to blue {far:.3g}")
 
 

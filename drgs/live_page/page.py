@@ -235,7 +235,7 @@ class Page:
         camera.fov = math.radians(start.camera.fov)
         camera.near, camera.far = 1e-3 * self._distance, 1e3 * self._distance
         self.add_controls()
-        with server.gui.add_folder("Looking"):
+        with server.gui.add_folder("View"):
             self.controls = CameraControls(server.gui, fitted, start.camera.fov, self.update)
         server.on_client_connect(self._connect)
         server.on_client_disconnect(self._disconnect)

@@ -5,6 +5,7 @@ Dr.Jit renders in one thread, between two iterations of a fit. Server threads on
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from drgs.live_page.frames import FrameRequest, LiveScene, ViewerFrame
 
 MOVING_SECONDS = 0.08  # maximum time of a frame of a moving camera: 12 fps look like a motion
 STILL_SECONDS = 0.15  # from the last request; browsers send one every 0.05 s while a camera moves
-DIVISORS = (1, 2, 3, 4, 6, 8)  # divisors of width and height while the camera moves
+MAX_DIVISOR = 8  # of width and height while the camera moves
 MIN_SIDE_PX = 64  # shorter side of a reduced frame
 
 
@@ -68,28 +69,6 @@ class RenderRequests:
         self._changed.clear()
 
 
-class AdaptiveResolution:
-    """Resolution of frames of a moving camera, adapted to take :data:`MOVING_SECONDS`."""
-
-    def __init__(self) -> None:
-        self._step = 1  # in DIVISORS
-
-    def divisor(self, request: FrameRequest) -> int:
-        """Return the divisor of the frame's width and height."""
-        largest = max(1, min(request.width, request.height) // MIN_SIDE_PX)
-        return min(DIVISORS[self._step], largest)
-
-    def update(self, divisor: int, seconds: float) -> None:
-        """Adapt to the time of the last frame of a moving camera."""
-        if seconds > MOVING_SECONDS:
-            self._step = min(self._step + 1, len(DIVISORS) - 1)
-        elif self._step > 0:
-            # At worst, the time is proportional to the number of pixels.
-            larger = DIVISORS[self._step - 1]
-            if seconds * (divisor / larger) ** 2 < MOVING_SECONDS:
-                self._step -= 1
-
-
 @dataclass
 class _ClientState:
     """The last frame of a client."""
@@ -98,7 +77,13 @@ class _ClientState:
     divisor: int = 1
     at: float = 0.0  # by time.monotonic
     seconds: float = 0.0
-    resolution: AdaptiveResolution = field(default_factory=AdaptiveResolution)
+    seconds_whole: float = 4 * MOVING_SECONDS  # of a frame at full resolution, at most
+
+    def divisor_in_motion(self, request: FrameRequest) -> int:
+        """Return the divisor with which a frame takes :data:`MOVING_SECONDS` at most."""
+        in_time = math.ceil(math.sqrt(self.seconds_whole / MOVING_SECONDS))
+        largest = min(MAX_DIVISOR, min(request.width, request.height) // MIN_SIDE_PX)
+        return max(1, min(in_time, largest))
 
 
 @dataclass
@@ -128,7 +113,7 @@ class RenderScheduler:
 
     def _due_divisor(self, pending: PendingRequest, state: _ClientState, now: float) -> int | None:
         if pending is not state.shown:
-            return state.resolution.divisor(pending.request)
+            return state.divisor_in_motion(pending.request)
         if state.divisor > 1:
             # In steps: the camera may move again after each.
             return state.divisor // 2 if now - pending.at >= STILL_SECONDS else None
@@ -140,7 +125,6 @@ class RenderScheduler:
         self, client: int, pending: PendingRequest, divisor: int, scene: Callable[[], LiveScene]
     ) -> None:
         state, request = self._clients[client], pending.request.smaller(divisor)
-        is_moving = pending is not state.shown
         start = time.monotonic()
         try:
             self.show(client, request, scene().frame(request), divisor == 1)
@@ -150,5 +134,5 @@ class RenderScheduler:
             divisor = 1  # a larger frame would fail, too
         state.shown, state.divisor, state.at = pending, divisor, time.monotonic()
         state.seconds = state.at - start
-        if is_moving:
-            state.resolution.update(divisor, state.seconds)
+        # At worst, the time is proportional to the number of pixels.
+        state.seconds_whole = state.seconds * divisor**2

@@ -11,11 +11,10 @@ import argparse
 import shlex
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 
 from drgs.cli.commands import CommandParser, file_or_folder, run_command
-from drgs.cli.progress import RunProgress
+from drgs.cli.progress import StepProgress
 from drgs.config.schema import DataConfig
 from drgs.core.errors import format_names
 from drgs.datasets.folders import find_reader
@@ -81,8 +80,9 @@ def run(args: argparse.Namespace) -> None:
     """Run the command."""
     started = time.perf_counter()
     settings = SfmSettings(args.camera_model, args.compare, args.share, args.mapper)
-    with ExitStack() as stack:
-        result = reconstruct(args.folder, settings, args.overwrite, _Steps(stack).update)
+    with StepProgress() as steps:
+        # Several models are begun, each with its first camera: their numbers go back.
+        result = reconstruct(args.folder, settings, args.overwrite, steps.update)
     print(description_of(result, settings))
     print(f"written: {args.folder / 'sparse' / '0'} in {time.perf_counter() - started:.0f} s")
     print(f"continue with: {fit_command(args.folder)}")
@@ -113,22 +113,6 @@ def description_of(result: SfmResult, settings: SfmSettings) -> str:
             f"{settings.alternative_options(total)}"
         )
     return "\n".join(lines)
-
-
-class _Steps:
-    """A progress bar for each of several steps, one after the other."""
-
-    def __init__(self, stack: ExitStack) -> None:
-        self._stack, self._what, self._most = stack, "", 0
-
-    def update(self, what: str, done: int, total: int) -> None:
-        if what != self._what:
-            self._stack.close()
-            self._what, self._most = what, -1
-            self._shown = self._stack.enter_context(RunProgress(what, total))
-        if done > self._most:  # several models are begun, each with its first camera
-            self._most = done
-            self._shown.update(done, total)
 
 
 if __name__ == "__main__":

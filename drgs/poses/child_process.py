@@ -9,9 +9,8 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from types import FrameType
+from collections.abc import Callable
+from contextlib import suppress
 from typing import IO, TypeVar
 
 from drgs.core.errors import UserError, one_line
@@ -23,62 +22,13 @@ class ChildEndedError(RuntimeError):
     """A signal ended the child; the message has its name and the child's last output."""
 
 
-class DeferredInterrupts:
-    """A context manager that defers Ctrl-C and SIGTERM to its end, or to :meth:`raise_interrupts`.
-
-    Outside of the main thread, which receives the signals, it does nothing.
-    """
-
-    def __init__(self) -> None:
-        self._arrived: int | None = None
-        self._raises = False
-        self._previous: dict[int, Callable[..., object] | int | None] = {}
-
-    def __enter__(self) -> DeferredInterrupts:
-        """Take over the signals, unless they are ignored."""
-        if threading.current_thread() is threading.main_thread():
-            handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
-            self._previous = {n: h for n, h in handlers.items() if h not in (signal.SIG_IGN, None)}
-            for number in self._previous:
-                signal.signal(number, self._handle)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Restore the handlers, and resend signals that arrived."""
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-        if self._arrived is not None:
-            signal.raise_signal(self._arrived)
-
-    @contextmanager
-    def raise_interrupts(self) -> Iterator[None]:
-        """Within the block, the first signal raises KeyboardInterrupt, also if it came before."""
-        try:
-            self._raises = True
-            if self._arrived is not None:
-                raise KeyboardInterrupt
-            yield
-        finally:
-            self._raises = False
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        self._arrived = number
-        if self._raises:
-            self._raises = False
-            raise KeyboardInterrupt
-
-
 def run_in_child(
-    function: Callable[..., Result],
-    *arguments: object,
-    watch: Callable[..., None],
-    interrupts: DeferredInterrupts,
+    function: Callable[..., Result], *arguments: object, watch: Callable[..., None]
 ) -> Result:
     """Return ``function(*arguments, report)``, called in a new process.
 
     function, arguments: can be pickled. watch: called here with the arguments of the child's
-    ``report``. interrupts: end the child, which Ctrl-C does not reach and which ends with this
-    process.
+    ``report``. Ctrl-C does not reach the child, which ends with this call or this process.
 
     Raises the child's :class:`UserError` or OSError, :class:`ChildEndedError` after a signal, and
     RuntimeError with the child's traceback for other errors.
@@ -96,8 +46,7 @@ def run_in_child(
             with suppress(BrokenPipeError):  # it has ended: see below
                 _send(child.stdin, (function, arguments))
             while True:
-                with interrupts.raise_interrupts():
-                    kind, content = pickle.load(child.stdout)
+                kind, content = pickle.load(child.stdout)
                 if kind == "result":
                     return content
                 if kind == "error":

@@ -28,14 +28,13 @@ from scipy.sparse.csgraph import connected_components
 
 from drgs.core.environment import require_module
 from drgs.core.errors import UserError, UserNote, format_names, one_line
-from drgs.core.files import refusal_reason
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.colmap import find_model
 from drgs.datasets.files import is_image, masks_of, without_masks
 from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
 from drgs.io.images import check_readable, image_size, write_png
-from drgs.poses.child_process import ChildEndedError, DeferredInterrupts, run_in_child
+from drgs.poses.child_process import ChildEndedError, run_in_child
 
 if TYPE_CHECKING:
     import pycolmap
@@ -131,14 +130,14 @@ def photographs_in(folder: Path) -> tuple[Path, list[str]]:
     below = folder / "images"
     photographs = below if below.is_dir() else folder
     try:
-        found = list(photographs.rglob("*") if photographs == below else photographs.iterdir())
+        images = list(photographs.rglob("*") if photographs == below else photographs.iterdir())
     except OSError as error:
         raise UserError(f"{folder}: cannot open the folder: {error.strerror or error}") from None
-    found = without_masks([p for p in found if is_image(p.name) and p.is_file()])
-    found.sort(key=_numeric_order)
-    files = [path for path in found if path.suffix.lower() in SUFFIXES]
+    images = without_masks([p for p in images if is_image(p.name) and p.is_file()])
+    images.sort(key=_numeric_order)
+    files = [path for path in images if path.suffix.lower() in SUFFIXES]
     others = format_names(
-        [path.relative_to(photographs) for path in found if path not in set(files)]
+        [path.relative_to(photographs) for path in images if path not in set(files)]
     )
     if not files:
         got = f"{others}, which COLMAP does not read; convert them to JPEG" if others else "none"
@@ -173,7 +172,7 @@ def reconstruct(folder: Path, settings: SfmSettings, replace: bool, watch: Progr
     """
     photographs, names = photographs_in(folder)
     model = folder / "sparse" / "0"
-    with DeferredInterrupts() as interrupts, sole_writer(folder) as keep:
+    with sole_writer(folder) as keep:
         _check_free(folder, model, replace)
         try:
             if keep():  # remove files of runs that were killed
@@ -183,20 +182,16 @@ def reconstruct(folder: Path, settings: SfmSettings, replace: bool, watch: Progr
             # On the disk to which the files are moved.
             parent = next(path for path in (model, *model.parents) if path.is_dir())
             with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=parent) as temporary:
-                found = run_in_child(
+                result = run_in_child(
                     _reconstruct_in_child, settings, photographs, folder, names, Path(temporary),
-                    watch=watch, interrupts=interrupts,
+                    watch=watch,
                 )  # fmt: skip
                 _install_model(Path(temporary, "model"), model)
-        except BrokenPipeError:  # of the output, whose reader has gone
-            raise
-        except OSError as error:
-            raise UserError(f"{model}: cannot write the model: {refusal_reason(error)}") from None
         except ChildEndedError as error:
             raise UserError(
                 f"{photographs}: structure from motion was ended: {error}; {REMEDY}"
             ) from None
-    return found
+    return result
 
 
 def _check_free(folder: Path, model: Path, replace: bool) -> None:
@@ -204,10 +199,10 @@ def _check_free(folder: Path, model: Path, replace: bool) -> None:
     for path in (model.parent, model):
         if os.path.lexists(path) and not path.is_dir():
             raise UserError(f"{path}: must be a folder, got something else; move it away")
-    if not replace and (found := find_model(folder)) is not None:
+    if not replace and (present := find_model(folder)) is not None:
         fit = shlex.join(["drgs", "fit", str(folder)])
         raise UserError(
-            f"{found[1]}: is there already; {fit} uses it, --overwrite writes {model}, which is "
+            f"{present[1]}: is there already; {fit} uses it, --overwrite writes {model}, which is "
             "then used instead"
         )
     FolderRecord(model, COMMAND).check(MODEL_FILES)
@@ -234,13 +229,13 @@ def _reconstruct_in_child(
     pycolmap = require_module("pycolmap", "colmap", "structure from motion")
     pycolmap.logging.minloglevel = 3  # errors are reported below
     try:
-        found, count = _Reconstruction(
+        model, count = _Reconstruction(
             pycolmap, folder, photographs, dataset, names, settings, watch
         ).largest()
         written = folder / "model"
         written.mkdir()
-        found.write_binary(written)
-        return _summarize(found, names, count)
+        model.write_binary(written)
+        return _summarize(model, names, count)
     except UserError:
         raise
     except (RuntimeError, ValueError) as error:  # pycolmap's, for errors of the user and its own
@@ -306,22 +301,12 @@ class _Reconstruction:
                 reader.mask_path = masks
             self.watch("photograph", done, len(self.names))
             # In this order: threads would number the photographs in the order of their ends.
-            pycolmap.import_images(
-                self.database,
-                self.photographs,
-                image_names=group,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                options=reader,
-            )
+            mode = pycolmap.CameraMode.SINGLE
+            pycolmap.import_images(self.database, self.photographs, mode, group, reader)
             sizes = PHOTOGRAPHS_AT_ONCE, done, len(self.names)
             for chunk in self._chunks("photograph", group, *sizes):
                 pycolmap.extract_features(
-                    self.database,
-                    self.photographs,
-                    image_names=chunk,
-                    camera_mode=pycolmap.CameraMode.SINGLE,
-                    reader_options=reader,
-                    extraction_options=options,
+                    self.database, self.photographs, chunk, mode, reader, options
                 )
                 self._check_features(chunk)
             done += len(group)
@@ -413,7 +398,7 @@ class _Reconstruction:
             placed = min(number, total)
             self.watch("camera", placed, total)
 
-        found = self.pycolmap.incremental_mapping(
+        models = self.pycolmap.incremental_mapping(
             self.database,
             self.photographs,
             self.folder / "models",
@@ -421,7 +406,7 @@ class _Reconstruction:
             initial_image_pair_callback=lambda: count(2),
             next_image_callback=lambda: count(placed + 1),
         )
-        return list(found.values())
+        return list(models.values())
 
     def _map_globally(self) -> list[pycolmap.Reconstruction]:
         """Return reconstructions of all photographs at once: of several passes, the largest."""
@@ -433,8 +418,8 @@ class _Reconstruction:
             calibration.random_seed = options.random_seed = SEED + done
             pycolmap.calibrate_view_graph(self.database, calibration)
             folder = self.folder / f"models {done}"
-            found = pycolmap.global_mapping(self.database, self.photographs, folder, options)
-            models = sorted(found.values(), key=_keep_connected)
+            mapped = pycolmap.global_mapping(self.database, self.photographs, folder, options)
+            models = sorted(mapped.values(), key=_keep_connected)
             if models and (not best or models[-1].num_reg_images() >= best[-1].num_reg_images()):
                 best = models
             known = self._set_lenses(models) < KNOWN_FOCAL
@@ -486,19 +471,19 @@ def _size_and_lens(file: Path) -> tuple[object, ...]:
     return *image_size(file), *map(str, lens)
 
 
-def _summarize(found: pycolmap.Reconstruction, names: Sequence[str], num_models: int) -> SfmResult:
-    placed = {image.name for image in found.images.values() if image.has_pose}
+def _summarize(model: pycolmap.Reconstruction, names: Sequence[str], num_models: int) -> SfmResult:
+    placed = {image.name for image in model.images.values() if image.has_pose}
     cameras = tuple(
         f"{camera.model.name} {camera.width} x {camera.height} px "
         f"({camera.params_info.replace(' ', '')}: "
         f"{', '.join(f'{value:.5g}' for value in camera.params)})"
-        for _, camera in sorted(found.cameras.items())
+        for _, camera in sorted(model.cameras.items())
     )
     return SfmResult(
         names=tuple(name for name in names if name in placed),
         missing=tuple(name for name in names if name not in placed),
         cameras=cameras,
-        num_points=found.num_points3D(),
-        error=found.compute_mean_reprojection_error(),
+        num_points=model.num_points3D(),
+        error=model.compute_mean_reprojection_error(),
         num_models=num_models,
     )

@@ -131,14 +131,13 @@ class Pinhole(Lens):
 
     @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        return _focal(camera) * points[:, :2] / points[:, 2:] + _principal(camera)
+        return camera.film_points(points)
 
     @override
     def slope_bounds(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Return the slopes (2,), (2,) of the film's corners (0, 0) and (W, H)."""
-        corners = np.array([[0.0, 0.0], [camera.width, camera.height]])
-        lower, upper = (corners - _principal(camera)) / _focal(camera)
-        return lower, upper
+        lower, upper = (0 - camera.principal), (camera.size - camera.principal)
+        return lower / camera.focal, upper / camera.focal
 
 
 @dataclass(frozen=True)
@@ -167,7 +166,7 @@ class OpenCV(Lens):
     @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         slopes = points[:, :2] / points[:, 2:]
-        return _focal(camera) * self.distort(slopes) + _principal(camera)
+        return camera.focal * self.distort(slopes) + camera.principal
 
     @override
     def is_seen(self, camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -187,7 +186,7 @@ class OpenCV(Lens):
         None if one of the border's points is the image of no slope within ``valid_radius``: the
         slopes of the others need not hold all that the film shows.
         """
-        border = (_film_border(camera) - _principal(camera)) / _focal(camera)
+        border = (_film_border(camera) - camera.principal) / camera.focal
         slopes = self.undistort(border)
         return (slopes.min(axis=0), slopes.max(axis=0)) if np.isfinite(slopes).all() else None
 
@@ -267,7 +266,7 @@ class Fisheye(Lens):
             k * theta ** (2 * i) for i, k in enumerate([1.0, self.k1, self.k2, self.k3, self.k4])
         )
         spread = (polynomial * theta_by_rho)[:, None]
-        return _focal(camera) * spread * points[:, :2] + _principal(camera)
+        return camera.focal * spread * points[:, :2] + camera.principal
 
     @override
     def depths(self, camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -312,7 +311,7 @@ class ThinPrismFisheye(Fisheye):
         rho = np.linalg.norm(points[:, :2], axis=1)
         theta_by_rho = np.arctan2(rho, points[:, 2]) / np.where(rho == 0, 1.0, rho)
         distorted = self.distort(theta_by_rho[:, None] * points[:, :2])
-        return _focal(camera) * distorted + _principal(camera)
+        return camera.focal * distorted + camera.principal
 
     def distort(self, places: np.ndarray) -> np.ndarray:
         """Return (..., 2) places (u', v') of places (u, v) (..., 2), which may be complex."""
@@ -368,7 +367,7 @@ class Orthographic(Lens):
 
     @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        return _focal(camera) * points[:, :2] + _principal(camera)
+        return camera.focal * points[:, :2] + camera.principal
 
     @override
     def view_directions(self, camera: Camera, means: np.ndarray) -> np.ndarray:
@@ -390,7 +389,7 @@ class Equirectangular(Lens):
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         x, y, z = points.T
         angles = np.column_stack([np.arctan2(x, z) / 2, np.arctan2(y, np.hypot(x, z))])
-        return np.array([camera.width, camera.height]) * (angles / np.pi + 0.5)
+        return camera.size * (angles / np.pi + 0.5)
 
     @override
     def depths(self, camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -467,14 +466,6 @@ def _first_fold(lens: OpenCV | ThinPrismFisheye, radius: float) -> float:
     return float(low)
 
 
-def _focal(camera: Camera) -> np.ndarray:
-    return np.array([camera.fx, camera.fy])
-
-
-def _principal(camera: Camera) -> np.ndarray:
-    return np.array([camera.cx, camera.cy])
-
-
 def _film_border(camera: Camera) -> np.ndarray:
     """Return (4 BORDER_SAMPLES, 2), px: evenly spaced points of the film's edges."""
     x = np.linspace(0, camera.width, BORDER_SAMPLES)
@@ -502,16 +493,8 @@ def _first_positive_root(coefficients: ArrayLike) -> float:
 class ThinLens:
     """An aperture, a disc about the camera's centre, and the plane that is in focus."""
 
-    aperture_radius: float  # world units
-    focus_distance: float  # world units: camera z of what is in focus
-
-    def __post_init__(self) -> None:
-        """Refuse numbers out of range."""
-        if not (0 <= self.aperture_radius < inf and 0 < self.focus_distance < inf):
-            raise ValueError(
-                "reference_effects.ThinLens: aperture_radius must be >= 0, focus_distance > 0 and "
-                f"both finite, got {self.aperture_radius} and {self.focus_distance}"
-            )
+    aperture_radius: float  # world units, >= 0
+    focus_distance: float  # world units, > 0: camera z of what is in focus
 
     def blur_radii(self, camera: Camera, depths: np.ndarray) -> np.ndarray:
         """Return (N, 2), px: half axes of the ellipse over which a point at depth (N,) is spread.
@@ -521,7 +504,7 @@ class ThinLens:
         f a (1 / focus_distance - 1 / z).
         """
         spread = self.aperture_radius * np.abs(1 / self.focus_distance - 1 / depths)
-        return _focal(camera) * spread[:, None]
+        return camera.focal * spread[:, None]
 
 
 def project(
@@ -548,7 +531,7 @@ def project(
 
     Splats with a singular cov2d, which low_pass = 0 permits, are not visible.
 
-    Raises ValueError for defocus behind an orthographic lens, whose rays meet in no aperture.
+    Defocus is not defined behind an orthographic lens, whose rays meet in no aperture.
     """
     points = (gaussians.means - camera.center) @ camera.rotation.T
     depths = lens.depths(camera, points)
@@ -559,21 +542,16 @@ def project(
     axes = camera.rotation @ reference.quat_to_rotation(gaussians.quats) * scales[:, None, :]
     axes2d = jacobians(lens, camera, _points_of_jacobian(lens, camera, points)) @ axes
     widening = np.full((len(points), 2), low_pass)
-    cov2d, dets, areas = _widen(axes2d, widening)
+    cov2d, dets, areas = reference.widened_covariances(axes2d, widening)
     singular = dets == 0
     opacities = reference.sigmoid(gaussians.logit_opacities)
     if antialiased:
         opacities = opacities * areas / np.sqrt(np.where(singular, 1.0, dets))
     above_cut, cuts = opacities > reference.ALPHA_CUT, reference.ALPHA_CUT
     if defocus is not None:
-        if isinstance(lens, Orthographic):
-            raise ValueError(
-                "reference_effects.project: defocus needs a lens whose rays meet in its centre, "
-                "got Orthographic"
-            )
         radii = defocus.blur_radii(camera, np.where(seen, depths, 1.0))
         dets_in_focus = dets
-        cov2d, dets, _ = _widen(axes2d, widening + radii**2 / 4)
+        cov2d, dets, _ = reference.widened_covariances(axes2d, widening + radii**2 / 4)
         singular = dets == 0
         dimming = np.sqrt(dets_in_focus / np.where(singular, 1.0, dets))
         opacities, cuts = opacities * dimming, np.maximum(cuts * dimming, MIN_CUT)
@@ -624,18 +602,6 @@ def _points_of_jacobian(lens: Lens, camera: Camera, points: np.ndarray) -> np.nd
     margin = reference.FRUSTUM_MARGIN * (upper - lower) / 2
     z = points[:, 2:]
     return np.hstack([np.clip(points[:, :2] / z, lower - margin, upper + margin) * z, z])
-
-
-def _widen(axes2d: np.ndarray, widening: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return cov2d = M M^T + diag(t) (N, 2, 2), det(cov2d) (N,) and sqrt(det(M M^T)) (N,).
-
-    M (N, 2, 3) px; t (N, 2) px^2. det(A + diag(t)) = det(A) + t0 A11 + t1 A00 + t0 t1: sums of
-    squares, like ``reference._low_passed_covariances``, which is the case t0 = t1.
-    """
-    areas = np.linalg.norm(np.cross(axes2d[:, 0], axes2d[:, 1]), axis=-1)
-    (a, b), (t0, t1) = np.sum(axes2d**2, axis=2).T, widening.T
-    cov2d = axes2d @ np.swapaxes(axes2d, 1, 2) + widening[:, :, None] * np.eye(2)
-    return cov2d, areas**2 + t0 * b + t1 * a + t0 * t1, areas
 
 
 # ----------------------------------------------------------------------------------------------
@@ -760,15 +726,8 @@ def _quat_of_rotation(rotation: np.ndarray) -> np.ndarray:
 def camera_at(camera_open: Camera, camera_close: Camera, t: float) -> Camera:
     """Return the camera at time t, 0 to 1, of the exposure; see ``interpolate_pose``.
 
-    Raises ValueError if the two differ in anything but their pose.
+    The two differ in nothing but their pose.
     """
-    for field in fields(Camera):
-        values = getattr(camera_open, field.name), getattr(camera_close, field.name)
-        if field.name not in ("rotation", "center") and values[0] != values[1]:
-            raise ValueError(
-                f"reference_effects.camera_at: {field.name} must be the same when the shutter "
-                f"opens and when it closes, got {values[0]} and {values[1]}"
-            )
     rotation, center = interpolate_pose(
         (camera_open.rotation, camera_open.center), (camera_close.rotation, camera_close.center), t
     )
@@ -847,24 +806,16 @@ def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     z >= near and the mean lies on its film, widened by 15 percent of its width and height on each
     side. A mean that no camera samples gets the smallest rate of all that are sampled, and so is
     smoothed most, as in Mip-Splatting's code, which gives it the largest distance.
-
-    Raises ValueError if there are means and no camera samples any of them.
     """
     rates = np.zeros(len(means))
     for camera in cameras:
         points = (means - camera.center) @ camera.rotation.T
         in_front = points[:, 2] >= camera.near
         points = np.where(in_front[:, None], points, (0.0, 0.0, 1.0))
-        size = np.array([camera.width, camera.height])
-        film = Pinhole().film_points(camera, points)
+        film, size = camera.film_points(points), camera.size
         on_film = (film >= -VIEW_MARGIN * size) & (film <= (1 + VIEW_MARGIN) * size)
         rate = max(camera.fx, camera.fy) / points[:, 2]
         rates = np.where(in_front & on_film.all(axis=1), np.maximum(rates, rate), rates)
-    if len(rates) and not rates.any():
-        raise ValueError(
-            f"reference_effects.sampling_rates: none of {len(cameras)} cameras sees any of the "
-            f"{len(rates)} means"
-        )
     return np.where(rates > 0, rates, rates[rates > 0].min(initial=inf))
 
 
@@ -895,8 +846,7 @@ def render_with_surfaces(
     """
     splats = reference.project(gaussians, camera)
     colors = reference.sh_colors(gaussians, camera, gaussians.sh_degree)
-    order = np.flatnonzero(splats.visible)
-    order = order[np.argsort(splats.depths[order], kind="stable")]
+    order = reference.depth_order(splats.depths, splats.visible)
     shape = camera.height, camera.width
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     color, depth, coverage = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)

@@ -52,24 +52,18 @@ def composite_segments(
     whitening = np.transpose(rotations, (0, 2, 1)) / np.exp(gaussians.log_scales)[:, :, None]
     opacities = reference.sigmoid(gaussians.logit_opacities)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
-    coefficients = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)[:, : (degree + 1) ** 2]
     passed = [
         _composite_segment(
             np.einsum("nij,nj->ni", whitening, origins[r] - gaussians.means),
             whitening @ directions[r],
             far[r],
             opacities,
-            _colors(coefficients, directions[r], degree),
+            np.maximum(reference.unclamped_colors(gaussians, directions[r][None], degree), 0.0),
             (alpha_max, alpha_cut, stop, close),
         )
         for r in range(len(origins))
     ]
     return SegmentRadiance(*(np.array(column) for column in zip(*passed, strict=True)))
-
-
-def _colors(coefficients: np.ndarray, direction: np.ndarray, degree: int) -> np.ndarray:
-    basis = reference.sh_basis(direction[None], degree)[0]
-    return np.maximum(np.einsum("k,nkc->nc", basis, coefficients) + 0.5, 0.0)
 
 
 def _composite_segment(

@@ -210,7 +210,7 @@ def render(
         place = block.rows, block.columns
         points = positions[place].reshape(-1, 2)
         pairs = _pairs(block, splats, points, model, threshold_width)
-        slopes = (points - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        slopes = (points - camera.principal) / camera.focal
         steps = model.step / np.sqrt(1 + np.sum(slopes**2, axis=1))  # in camera z
         weights, behind, near = _composite(pairs, steps, model, threshold_width)
 
@@ -239,7 +239,7 @@ def _pair_colors(
     """Return the colours (M', 3) of the pairs that are ``seen`` (M,), display space, >= 0."""
     if model.sh_direction == "mean":
         return splats.colors[pairs.splats[seen]]
-    slopes = (points - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    slopes = (points - camera.principal) / camera.focal
     rays = np.column_stack([slopes, np.ones(len(slopes))]) @ camera.rotation
     directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     degree = round(splats.sh.shape[1] ** 0.5) - 1
@@ -267,10 +267,10 @@ def _splats(gaussians: Gaussians, camera: Camera, model: ImageModel) -> _Splats:
     slopes = affine.means[:, :2] / z[:, None] if model.projection == "exact" else affine.ratios
     axes2d = _film_axes(affine, camera, slopes)
     depth_cov = np.einsum("nij,nj->ni", axes2d, affine.axes[:, 2]) / z[:, None]
-    means2d = _film_positions(affine.means, camera)
+    means2d = camera.film_points(affine.means)
     if model.projection == "unscented":
         means2d, axes2d = _unscented_transform(affine, camera, means2d)
-    cov2d, dets, areas = _low_passed_covariances(axes2d, model.low_pass)
+    cov2d, dets, areas = reference.widened_covariances(axes2d, model.low_pass)
 
     opacities = reference.sigmoid(gaussians.logit_opacities)
     if model.antialiased and model.low_pass > 0:
@@ -295,16 +295,10 @@ def _splats(gaussians: Gaussians, camera: Camera, model: ImageModel) -> _Splats:
     return _rows(splats, (opacities > model.alpha_cut) & (extended | (model.low_pass > 0)))
 
 
-def _film_positions(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the pinhole projections (..., 2), px, of points (..., 3) in camera axes, z > 0."""
-    focal, principal = [camera.fx, camera.fy], [camera.cx, camera.cy]
-    return focal * points[..., :2] / points[..., 2:] + principal
-
-
 def _film_axes(affine: reference.LocalAffine, camera: Camera, slopes: np.ndarray) -> np.ndarray:
     """Return M = F A0 V / m_z (N, 2, 3), px, S = V V^T, where A0 has the given slopes (N, 2)."""
     along_film = affine.axes[:, :2] - slopes[:, :, None] * affine.axes[:, 2:]
-    return along_film * [[camera.fx], [camera.fy]] / affine.means[:, 2, None, None]
+    return along_film * camera.focal[:, None] / affine.means[:, 2, None, None]
 
 
 def _unscented_transform(
@@ -322,7 +316,7 @@ def _unscented_transform(
     points = np.concatenate([means, means + steps, means - steps], axis=1)
     nearest = points[..., 2].min(axis=1)
     usable = affine.unclamped.all(axis=1) & (nearest >= MIN_POINT_DEPTH * affine.means[:, 2])
-    film = _film_positions(np.where(usable[:, None, None], points, means), camera)
+    film = camera.film_points(np.where(usable[:, None, None], points, means))
     centers = np.sum(film[:, 1:], axis=1) / 6
     weights = np.array([2.0] + 6 * [1 / 6])
     axes2d = np.swapaxes((film - centers[:, None]) * np.sqrt(weights)[:, None], 1, 2)
@@ -330,20 +324,6 @@ def _unscented_transform(
     affine_axes[:, :, :3] = affine.axes2d
     usable = usable[:, None]
     return np.where(usable, centers, means2d), np.where(usable[:, None], axes2d, affine_axes)
-
-
-def _low_passed_covariances(
-    axes2d: np.ndarray, low_pass: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return C = M M^T + low_pass I (N, 2, 2), det C (N,), sqrt(det M M^T) (N,), of M (N, 2, K).
-
-    As in ``reference``, determinants are sums of squares: those of the 2 x 2 minors of M.
-    """
-    x, y = axes2d[:, 0], axes2d[:, 1]
-    minors = x[:, :, None] * y[:, None, :] - y[:, :, None] * x[:, None, :]
-    areas = np.sqrt(np.sum(minors**2, axis=(1, 2)) / 2)
-    dets = areas**2 + low_pass * np.sum(axes2d**2, axis=(1, 2)) + low_pass**2
-    return axes2d @ np.swapaxes(axes2d, 1, 2) + low_pass * np.eye(2), dets, areas
 
 
 def _whitened_rays(affine: reference.LocalAffine, camera: Camera, low_pass: float) -> np.ndarray:
@@ -358,7 +338,7 @@ def _whitened_rays(affine: reference.LocalAffine, camera: Camera, low_pass: floa
     is bounded below by the low-pass except in its last element, the deviation in depth at a fixed
     place on the film, which is small only where the whole row is.
     """
-    focal, z = np.array([camera.fx, camera.fy]), affine.means[:, 2]
+    focal, z = camera.focal, affine.means[:, 2]
     if low_pass == 0:
         largest = np.max(affine.scales, axis=1, keepdims=True)
         largest = np.where(largest > 0, largest, 1.0)

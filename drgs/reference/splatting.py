@@ -73,22 +73,31 @@ class Camera:
     cy: float  # px, film
     width: int  # px
     height: int  # px
-    near: float = 0.01  # world units: means with a smaller camera z are culled
+    near: float = 0.01  # world units, > 0: means with a smaller camera z are culled
 
     def __post_init__(self) -> None:
-        """Convert to float64 and check shapes."""
-        for name, shape in {"rotation": (3, 3), "center": (3,)}.items():
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            if value.shape != shape:
-                raise ValueError(
-                    f"reference.Camera: {name} must have shape {shape}, got {value.shape}"
-                )
-            object.__setattr__(self, name, value)
-        if not self.near > 0:
-            raise ValueError(
-                f"reference.Camera: near must be > 0, since projection divides by z, "
-                f"got {self.near}"
-            )
+        """Convert to float64."""
+        for name in ("rotation", "center"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+
+    @property
+    def focal(self) -> np.ndarray:
+        """(fx, fy), px."""
+        return np.array([self.fx, self.fy])
+
+    @property
+    def principal(self) -> np.ndarray:
+        """(cx, cy), px, film."""
+        return np.array([self.cx, self.cy])
+
+    @property
+    def size(self) -> np.ndarray:
+        """(width, height), px."""
+        return np.array([self.width, self.height])
+
+    def film_points(self, points: np.ndarray) -> np.ndarray:
+        """Return (fx x/z + cx, fy y/z + cy), (..., 2) px, of points (..., 3) in camera axes."""
+        return self.focal * points[..., :2] / points[..., 2:] + self.principal
 
 
 @dataclass(frozen=True)
@@ -100,31 +109,12 @@ class Gaussians:
     log_scales: np.ndarray  # (N, 3) natural logarithm of standard deviations in world units
     logit_opacities: np.ndarray  # (N,)
     sh0: np.ndarray  # (N, 1, 3) coefficient of degree 0, RGB, display space
-    shN: np.ndarray  # (N, K - 1, 3) the others, K = (degree + 1)^2  # noqa: N815
+    shN: np.ndarray  # (N, K - 1, 3) the others, K = (degree + 1)^2, degree 0 to 3  # noqa: N815
 
     def __post_init__(self) -> None:
-        """Convert to float64 and check shapes."""
-        for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN"):
+        """Convert to float64."""
+        for name in vars(self):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
-        n = len(self.means)
-        shapes = {
-            "means": (n, 3),
-            "quats": (n, 4),
-            "log_scales": (n, 3),
-            "logit_opacities": (n,),
-            "sh0": (n, 1, 3),
-        }
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(
-                    f"reference.Gaussians: {name} must have shape {shape} like the {n} means, "
-                    f"got {getattr(self, name).shape}"
-                )
-        if self.shN.shape not in [(n, (degree + 1) ** 2 - 1, 3) for degree in range(4)]:
-            raise ValueError(
-                f"reference.Gaussians: shN must have shape ({n}, 0, 3), ({n}, 3, 3), "
-                f"({n}, 8, 3) or ({n}, 15, 3) for degree 0, 1, 2 or 3, got {self.shN.shape}"
-            )
 
     @property
     def sh_degree(self) -> int:
@@ -154,6 +144,7 @@ class RenderedImage:
     depth: np.ndarray  # (H, W) sum of T alpha z: premultiplied by alpha, world units
     transmittance: np.ndarray  # (H, W) share of the background that is seen
     near_threshold: np.ndarray  # (H, W) bool: a decision of this pixel may flip in float32
+    stops: np.ndarray | None = None  # (H, W) of ``composite``: rank in depth at which it stopped
 
 
 # ----------------------------------------------------------------------------------------------
@@ -215,7 +206,6 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     Column l^2 + l + m holds degree l, order m, with the signs of 3DGS. They are orthonormal on
     the sphere.
     """
-    _check_degree("sh_basis", degree, 3)
     x, y, z = directions.T
     basis = [
         C_00 * np.ones_like(x),
@@ -243,7 +233,6 @@ def sh_basis_gradient(directions: np.ndarray, degree: int) -> np.ndarray:
 
     x, y, z vary independently here; the unit length of a direction is the caller's business.
     """
-    _check_degree("sh_basis_gradient", degree, 3)
     x, y, z = directions.T
     zero, one = np.zeros_like(x), np.ones_like(x)
     gradient = [
@@ -283,14 +272,16 @@ def _view_directions(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, 
 
 
 def unclamped_colors(gaussians: Gaussians, directions: np.ndarray, degree: int) -> np.ndarray:
-    """Return colours (N, 3) before they are clamped at zero; directions: (N, 3) unit, world."""
-    basis = sh_basis(directions, degree)
-    return np.einsum("nk,nkc->nc", basis, _sh_coefficients(gaussians, degree)) + 0.5
+    """Return colours (N, 3) before they are clamped at zero.
+
+    directions: unit, world, (N, 3) or, for all Gaussians, (1, 3).
+    """
+    colors = sh_basis(directions, degree)[..., None] * _sh_coefficients(gaussians, degree)
+    return np.sum(colors, axis=1) + 0.5
 
 
 def _sh_coefficients(gaussians: Gaussians, degree: int) -> np.ndarray:
     """Return (N, K, 3): the coefficients up to ``degree``."""
-    _check_degree("sh_colors", degree, gaussians.sh_degree)
     coefficients = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
     return coefficients[:, : (degree + 1) ** 2]
 
@@ -331,11 +322,8 @@ def local_affine(gaussians: Gaussians, camera: Camera) -> LocalAffine:
     camera_means = np.where(in_front[:, None], camera_means, (0.0, 0.0, 1.0))
     z = camera_means[:, 2]
 
-    focal = np.array([camera.fx, camera.fy])
-    principal = np.array([camera.cx, camera.cy])
-    size = np.array([camera.width, camera.height])
-    lower = (0 - principal) / focal
-    upper = (size - principal) / focal
+    lower = (0 - camera.principal) / camera.focal
+    upper = (camera.size - camera.principal) / camera.focal
     margin = FRUSTUM_MARGIN * (upper - lower) / 2
     true_ratios = camera_means[:, :2] / z[:, None]
     ratios = np.clip(true_ratios, lower - margin, upper + margin)
@@ -372,14 +360,13 @@ def project(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
     brightening that the low-pass causes (Mip-Splatting, section 4.2).
     """
     affine = local_affine(gaussians, camera)
-    x, y, z = affine.means.T
-    cov2d, dets, areas = _low_passed_covariances(affine.axes2d)
+    cov2d, dets, areas = widened_covariances(affine.axes2d, LOW_PASS)
     opacities = sigmoid(gaussians.logit_opacities)
     if antialiased:
         opacities = opacities * areas / np.sqrt(dets)
     depths = (gaussians.means - camera.center) @ camera.rotation[2]
     return Projection(
-        means2d=np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1),
+        means2d=camera.film_points(affine.means),
         cov2d=cov2d,
         conics=_inverses(cov2d, dets),
         depths=depths,
@@ -388,18 +375,24 @@ def project(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
     )
 
 
-def _low_passed_covariances(axes2d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return cov2d = M M^T + 0.3 I (N, 2, 2), det(cov2d) (N,) and sqrt(det(M M^T)) (N,).
+def widened_covariances(
+    axes2d: np.ndarray, widening: ArrayLike
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return cov2d = M M^T + diag(t) (N, 2, 2), det(cov2d) (N,) and sqrt(det(M M^T)) (N,).
+
+    axes2d: M (N, 2, K), px; widening: t (N, 2), px^2, or one number for all.
 
     The determinants are sums of squares, which cannot cancel: by Cauchy-Binet det(M M^T) is the
-    sum of the squared 2 x 2 minors of M, which are the components of the cross product of its
-    two rows, and det(A + t I) = det(A) + t trace(A) + t^2.
+    sum of the squared 2 x 2 minors of M, each of which stands twice in x y^T - y x^T with the rows
+    x and y of M, and det(A + diag(t)) = det(A) + t0 A11 + t1 A00 + t0 t1.
     """
-    areas = np.linalg.norm(np.cross(axes2d[:, 0], axes2d[:, 1]), axis=-1)
-    traces = np.sum(axes2d**2, axis=(1, 2))
-    dets = areas**2 + LOW_PASS * traces + LOW_PASS**2
-    cov2d = axes2d @ _transpose(axes2d) + LOW_PASS * np.eye(2)
-    return cov2d, dets, areas
+    x, y = axes2d[:, 0], axes2d[:, 1]
+    minors = x[:, :, None] * y[:, None, :] - y[:, :, None] * x[:, None, :]
+    areas = np.sqrt(np.sum(minors**2, axis=(1, 2)) / 2)
+    t = np.broadcast_to(widening, (len(x), 2))
+    dets = areas**2 + t[:, 0] * np.sum(y**2, axis=-1) + t[:, 1] * np.sum(x**2, axis=-1)
+    cov2d = axes2d @ _transpose(axes2d) + t[:, :, None] * np.eye(2)
+    return cov2d, dets + t[:, 0] * t[:, 1], areas
 
 
 def _inverses(matrices: np.ndarray, dets: np.ndarray) -> np.ndarray:
@@ -512,28 +505,6 @@ def composite(
     period: px along x after which a splat is seen again, of which a pixel has the nearest; None:
     never.
     """
-    rendered, _ = composite_and_stops(
-        means2d, conics, opacities, colors, depths, visible, background, width, height,
-        threshold_width, cuts, period,
-    )  # fmt: skip
-    return rendered
-
-
-def composite_and_stops(
-    means2d: np.ndarray,
-    conics: np.ndarray,
-    opacities: np.ndarray,
-    colors: np.ndarray,
-    depths: np.ndarray,
-    visible: np.ndarray,
-    background: ArrayLike,
-    width: int,
-    height: int,
-    threshold_width: float,
-    cuts: np.ndarray | float | None = None,
-    period: float | None = None,
-) -> tuple[RenderedImage, np.ndarray]:
-    """Return ``composite``'s image and the rank in depth (H, W) at which each pixel stopped."""
     means2d, conics, opacities, colors, depths, background = _as_float64(
         means2d, conics, opacities, colors, depths, background
     )
@@ -574,7 +545,7 @@ def composite_and_stops(
         transmittance[box] = np.where(contributes, behind, transmittance[box])
 
     image += transmittance[..., None] * background
-    return RenderedImage(image, 1 - transmittance, depth, transmittance, near_threshold), stops
+    return RenderedImage(image, 1 - transmittance, depth, transmittance, near_threshold, stops)
 
 
 def render(
@@ -648,10 +619,10 @@ def composite_gradients(
     d_alpha, d_depth = _as_float64(
         zeros if d_alpha is None else d_alpha, zeros if d_depth is None else d_depth
     )
-    rendered, stops = composite_and_stops(
-        means2d, conics, opacities, colors, depths, visible, background, width, height,
-        THRESHOLD_WIDTH,
-    )  # fmt: skip
+    rendered = composite(
+        means2d, conics, opacities, colors, depths, visible, background, width, height
+    )
+    assert rendered.stops is not None, "composite sets it"
     order = depth_order(depths, visible)
     boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], ALPHA_CUT, width, height)
 
@@ -669,7 +640,7 @@ def composite_gradients(
         i, box = order[rank], boxes[rank]
         splat = _footprint(box, means2d[i], conics[i], opacities[i])
         alpha = np.minimum(splat.raw_alpha, ALPHA_MAX)
-        contributes = (rank < stops[box]) & (alpha >= ALPHA_CUT)
+        contributes = (rank < rendered.stops[box]) & (alpha >= ALPHA_CUT)
         alpha = np.where(contributes, alpha, 0.0)
 
         transmittance[box] /= 1 - alpha
@@ -730,7 +701,7 @@ def project_gradients(
     d_cov2d = -splats.conics @ d_conics @ splats.conics
     d_axes2d = np.zeros_like(affine.axes2d)
     if antialiased:
-        _, dets, areas = _low_passed_covariances(affine.axes2d)
+        _, dets, areas = widened_covariances(affine.axes2d, LOW_PASS)
         compensations = areas / np.sqrt(dets)
         d_compensations = d_opacities * opacities
         d_opacities = d_opacities * compensations
@@ -922,8 +893,3 @@ def _rows_where(condition: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def _transpose(matrices: np.ndarray) -> np.ndarray:
     return np.swapaxes(matrices, -1, -2)
-
-
-def _check_degree(where: str, degree: int, highest: int) -> None:
-    if degree not in range(highest + 1):
-        raise ValueError(f"reference.{where}: degree must be 0 to {highest}, got {degree}")

@@ -5,8 +5,8 @@
 load Python plugins). Cameras of Gaussians are the photographs' (``--split``, with metrics), an
 orbit (``--orbit``), a file's (``--camera``) or one (``--origin``).
 
-Writes a PNG per image, and ``metrics.json`` (``--split``), ``orbit.webp`` and ``orbit.gif``
-(``--orbit``), or an EXR per image (scenes).
+Writes a PNG per image, and ``metrics.json`` (``--split``) or ``orbit.webp`` (``--orbit``), or an
+EXR per image (scenes).
 """
 
 from __future__ import annotations
@@ -241,12 +241,12 @@ def _check_cameras(args: argparse.Namespace) -> None:
     if args.panorama and args.fov is not None:
         raise UserError(f"--fov: a panorama shows all directions, got {args.fov:g}; leave it out")
     way = way or "split"
-    used, place = {way, *CAMERA_OPTIONS[way], *MODEL_OPTIONS}, f"Gaussians and --{way}"
+    used, context = {way, *CAMERA_OPTIONS[way], *MODEL_OPTIONS}, f"Gaussians and --{way}"
     if not has_photographs:
-        used, place = used - {"data", "set"}, f"{place} but without --scene CONFIG.yml"
+        used, context = used - {"data", "set"}, f"{context} but without --scene CONFIG.yml"
     elif way == "orbit":
-        used, place = used - {"up"}, f"{place}, where it follows from the photographs' cameras"
-    _check_options(args, used, place)
+        used, context = used - {"up"}, f"{context}, where it follows from the photographs' cameras"
+    _check_options(args, used, context)
     if way == "split" and isinstance(parse_background(args.background), Path):
         raise UserError(
             "--background: an image is not what the photographs were composited over; use it with "
@@ -254,10 +254,10 @@ def _check_cameras(args: argparse.Namespace) -> None:
         )
 
 
-def _check_options(args: argparse.Namespace, used: set[str], place: str) -> None:
+def _check_options(args: argparse.Namespace, used: set[str], context: str) -> None:
     for name in sorted(ALL_OPTIONS - used):
         if getattr(args, name) is not None:
-            raise UserError(f"--{name}: is not used with {place}")
+            raise UserError(f"--{name}: is not used with {context}")
 
 
 def _definition(word: str) -> tuple[str, str]:

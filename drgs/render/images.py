@@ -24,7 +24,7 @@ from drgs.core.files import atomic_path
 from drgs.datasets.camera_file import read_viewpoints
 from drgs.effects.cameras import CAMERAS, CamerasConfig
 from drgs.io.images import check_animation, write_animation
-from drgs.results.files import METRICS, ORBIT, ORBIT_GIF
+from drgs.results.files import METRICS, ORBIT
 from drgs.results.metrics import Quality, mean_of, psnr, ssim
 from drgs.results.model import ImageFolder, Model
 from drgs.results.model_arguments import UP
@@ -91,7 +91,7 @@ def render_orbit(model: Model, args: argparse.Namespace, folder: ImageFolder) ->
     viewpoints = orbit.viewpoints(args.orbit, width, height, fov)
     if args.panorama:
         viewpoints = [panorama(view, orbit.up) for view in viewpoints]
-    images = render_cameras(model, viewpoints, folder, [ORBIT, ORBIT_GIF])
+    images = render_cameras(model, viewpoints, folder, [ORBIT])
     write_animation(folder.path / ORBIT, images)
 
 

@@ -151,6 +151,16 @@ def is_finished(folder: Path, config: FitConfig) -> bool:
     return has_results(folder) and not _differences_of_run(folder, config)
 
 
+def require_results(folder: Path, *names: str) -> None:
+    """Raise :class:`UserError` for a folder without ``config.yml`` and these results of a fit."""
+    for name in (CONFIG, *names):
+        if not (folder / name).is_file():
+            raise UserError(
+                f"{folder}: must be the output folder of a fit that has ended, but there is no "
+                f"{name} in it"
+            )
+
+
 def load_run_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
     """Load the configuration of the run in ``folder``; overrides: see :func:`load_config`.
 

@@ -38,7 +38,7 @@ MAX_PAGE_BYTES = 25_000_000
 """Maximum size of a fit's page, a usual limit of mail attachments: half a million Gaussians of
 degree 3. Chromium opens a million in 5 s on two cores without a graphics card."""
 
-MIN_GZIP_RATIO = 0.5  # of a compressed PLY; measured: 0.55 to 0.61 for fits
+GZIP_RATIO = 0.6  # of a compressed PLY; measured: 0.55 to 0.61 for fits
 SECONDS_PER_BYTE = 0.2e-6  # of a compressed PLY; measured: 0.15e-6 to 0.2e-6 on two cores (Zen 4)
 
 HONOURED = frozenset({"low_pass", "antialiased"})
@@ -148,14 +148,14 @@ def viewer_page(
     return page.encode("utf-8", "backslashreplace")
 
 
-def min_page_bytes(num_gaussians: int, sh_degree: int) -> int:
-    """Return a lower bound of a page's size: its Gaussians in base64."""
-    return int(4 / 3 * MIN_GZIP_RATIO * _file_bytes(num_gaussians, sh_degree))
+def estimate_page_bytes(num_gaussians: int, sh_degree: int) -> int:
+    """Estimate a page's size: its Gaussians in base64."""
+    return int(4 / 3 * GZIP_RATIO * _file_bytes(num_gaussians, sh_degree))
 
 
 def seconds_of_page(num_gaussians: int, sh_degree: int) -> float:
     """Estimate the time of :func:`write_viewer`."""
-    if min_page_bytes(num_gaussians, sh_degree) > MAX_PAGE_BYTES:
+    if estimate_page_bytes(num_gaussians, sh_degree) > MAX_PAGE_BYTES:
         return 0.0
     return SECONDS_PER_BYTE * _file_bytes(num_gaussians, sh_degree)
 
@@ -166,22 +166,20 @@ def write_viewer(out: Path, dataset: Dataset, shown: DisplaySettings) -> None:
     Warns with a ``UserNote`` instead if the page would exceed :data:`MAX_PAGE_BYTES`.
     """
     gaussians = shown.gaussians
-    size, least = min_page_bytes(gaussians.num_gaussians, gaussians.sh_degree), "at least "
-    page = b""
-    if size <= MAX_PAGE_BYTES:
-        views = refined_viewpoints(out, dataset.origin) or dataset.train
-        initial_view = InitialView.from_views(views, gaussians)
-        page = viewer_page(out.resolve().name, shown, initial_view, dataset.background)
-        size, least = len(page), ""
+    size = estimate_page_bytes(gaussians.num_gaussians, gaussians.sh_degree)
     if size > MAX_PAGE_BYTES:
         note = (
-            f"{out / VIEWER}: not written, as it would have {least}{size / 1e6:.0f} MB, more than "
+            f"{out / VIEWER}: not written, as it would have about {size / 1e6:.0f} MB, more than "
             f"{MAX_PAGE_BYTES / 1e6:.0f}; drgs export {out} --format html writes it"
         )
         warnings.warn(UserNote(note), stacklevel=2)
         return
+    views = refined_viewpoints(out, dataset.origin) or dataset.train
+    initial_view = InitialView.from_views(views, gaussians)
     with atomic_path(out / VIEWER) as temporary:
-        temporary.write_bytes(page)
+        temporary.write_bytes(
+            viewer_page(out.resolve().name, shown, initial_view, dataset.background)
+        )
 
 
 def _file_bytes(num_gaussians: int, sh_degree: int) -> int:

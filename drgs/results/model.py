@@ -38,7 +38,7 @@ from drgs.integrator.summary import format_effects, summary_of_views
 from drgs.integrator.types import is_splats
 from drgs.io.images import write_png
 from drgs.results.files import CONFIG, ERROR_BUDGET, GAUSSIANS
-from drgs.results.folder import relocate_data
+from drgs.results.folder import relocate_data, require_results
 from drgs.results.refined_cameras import refined_dataset
 
 if TYPE_CHECKING:  # imported where there is an error budget
@@ -209,12 +209,7 @@ def load_model(
     """
     path, config_path = what, scene
     if what.is_dir():
-        for name in (CONFIG, GAUSSIANS):
-            if not (what / name).is_file():
-                raise UserError(
-                    f"{what}: must be the output folder of a fit that has ended, but there is no "
-                    f"{name} in it"
-                )
+        require_results(what, GAUSSIANS)
         config_path, path = scene or what / CONFIG, what / GAUSSIANS
     config = None if config_path is None else load_open_config(config_path, overrides, background)
     if config is not None and what.is_dir() and scene is None:

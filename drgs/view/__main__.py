@@ -65,11 +65,6 @@ def add_arguments(parser: CommandParser) -> None:
         "cameras; 0 0 1 for a file)",
     )
     parser.add_argument(
-        "--address",
-        metavar="ADDRESS",
-        help="address of the page (default: 127.0.0.1, reachable from this machine only)",
-    )
-    parser.add_argument(
         "--port",
         type=bounded_int(1, MAX_PORT),
         metavar="N",
@@ -82,7 +77,7 @@ def add_arguments(parser: CommandParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
     require_module("viser", "viewer", "drgs view")
-    from drgs.live_page.server import ADDRESS, run_server, url
+    from drgs.live_page.server import run_server, url
 
     if not args.what.exists():
         raise UserError(f"{args.what}: there is no such file or folder")
@@ -94,12 +89,12 @@ def run(args: argparse.Namespace) -> None:
             model = model.within_error(args.error, views)
         scene = LiveScene(model.gaussians, model.settings, model.background)
         requests, start = RenderRequests(), start_of(args, model, views)
-        options = ("--address", "--port")
-        with run_server(args.address or ADDRESS, args.port, options) as server:
+        with run_server(args.port, "--port") as server:
             page = Page(server, requests, start, scene.approximations)
             if len(views) > 1:
                 page.add_cameras(views, visible=False)
-            print(f"{model.gaussians.num_gaussians:,} Gaussians: look at {url(server)}", flush=True)
+            count = model.gaussians.num_gaussians
+            print(f"{count:,} Gaussians; live view: {url(server)}", flush=True)
             print("Ctrl-C ends this", flush=True)
             scheduler = RenderScheduler(requests, page.show, page.refuse)
             with StopRequest() as stop:

@@ -15,8 +15,7 @@ import mitsuba as mi
 import numpy as np
 from drgs.bench.output import machine, markdown_table
 from drgs.export.decimation import decimate
-from drgs.export.merging import merge_down
-from drgs.export.selection import take
+from drgs.export.merging import merge_down, take
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, make_sensors, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor

@@ -22,7 +22,7 @@ from drgs.config.load import load_config
 from drgs.config.schema import ModelConfig
 from drgs.core.registry import Extension
 from drgs.datasets import Dataset, load_dataset
-from drgs.export.__main__ import load_source
+from drgs.export.source import load_source
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.io.formats import writable_formats

@@ -28,21 +28,23 @@ import drjit.llvm.ad as llvm
 import mitsuba as mi
 import numpy as np
 from drgs.bench.output import machine, markdown_table
-from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of
-from drgs.bench.timing import (
+from drgs.bench.scenes import bench_camera, bench_gaussians
+from drgs.bench.timing import seconds
+from drgs.core.private import disable_avx512
+from drgs.splatting.grid import PIXELS
+from machine_code import MachineCodeError, assembly, count_operations, innermost_loop
+from stages import (
     COPIES,
     STAGES,
+    Scene,
     StageClock,
     Work,
     clocked_step,
     count_work,
-    seconds,
+    frame_of,
     steps,
     warm_trainer,
 )
-from drgs.core.private import disable_avx512
-from drgs.splatting.grid import PIXELS
-from machine_code import MachineCodeError, assembly, count_operations, innermost_loop
 
 ROUNDS = 15
 

@@ -33,19 +33,25 @@ import numpy as np
 from drgs.bench.output import machine, markdown_table
 from drgs.bench.scenes import (
     BENCH_FIELD_OF_VIEW,
-    Scene,
     bench_camera,
-    bench_config,
     bench_gaussians,
-    frame_of,
 )
-from drgs.bench.timing import STAGES, StageClock, clocked_step, steps, warm_trainer
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 from drgs.reference.splatting import Camera
 from drgs.splatting.rendering import on_film
 from drgs.training.trainer import Trainer
 from kernels import Launch, counted_launches, vector_trips, vector_width
+from stages import (
+    STAGES,
+    Scene,
+    StageClock,
+    bench_config,
+    clocked_step,
+    frame_of,
+    steps,
+    warm_trainer,
+)
 
 ROUNDS = 6
 

@@ -29,7 +29,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from drgs.bench.output import machine, markdown_table
-from drgs.bench.timing import seconds, steps
+from drgs.bench.timing import seconds
 from drgs.config.changes import with_changes
 from drgs.core.environment import denormals_flushed
 from drgs.core.processes import end_job_on_error, process_number
@@ -40,6 +40,7 @@ from drgs.results.folder import load_run_config
 from drgs.training.parallel import exchange
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import Trainer
+from stages import steps
 
 STEPS = 4
 

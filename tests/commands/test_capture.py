@@ -377,25 +377,15 @@ def test_edited_files_are_kept(ball, tmp_path):
 
 OPTIONS = [
     (["--views", 0], "--views: must be a whole number >= 1, got 0"),
-    (["--test-views", -1], "--test-views: must be a whole number >= 0, got -1"),
     (["--size", 400], "--size: expected 2 arguments: --size W H"),
-    (["--size", 0, 9], "--size: must be a whole number >= 1, got 0"),
     (["--size", 10**9, 10**9], "size must be at most 16,777,216 px"),
-    (["--size", 10**20, 1], "--size: must be at most 2,147,483,647"),
     (["--size", 4000, 4000], "4000 x 4000 px need about 4 GB of memory, of which 2 GB are avail"),
     (["--fov", 181], "--fov: must be between 0 and 180 degrees, got 181"),
-    (["--fov", 0], "--fov: must be between 0 and 180 degrees, got 0"),
-    (["--fov", "nan"], "--fov: must be a finite number, got nan"),
     (["--distance", -1], "distance must be > 0, got -1"),
     (["--distance", 1e300], "no camera may be farther from the scene than 100000 of its"),
     (["--distance", 3, "--target", 900, 0, 0], "the cameras see nothing of the scene"),
     (["--target", 0, "inf", 0], "--target: must be a finite number, got inf"),
-    (["--target", 1e300, 0, 0], "no camera may be farther from the scene than 100000"),
     (["--points", 10**9], "--points: must be at most 5,000,000"),
-    (["--views", 10**9], "--views: must be at most 100,000"),
-    (["--spp", 10**9], "--spp: must be at most 1,048,576"),
-    (["--max-depth", 10**9], "--max-depth: must be at most 65,536"),
-    (["--seed", "9" * 5000], "--seed: must be a whole number"),
     (["--out", "/dev/null/out"], "/dev/null"),
 ]
 
@@ -419,7 +409,6 @@ SCENES = [
     ("a.xml", XML.format('<emitter type="constant"/>'), "no surfaces"),
     ("a.py", "x = 1", "must define a function scene()"),
     ("a.py", "def scene():\n    return []", 'must return a dictionary with "type": "scene"'),
-    ("a.py", "def scene():\n    return {'type': 'sphere'}", 'with "type": "scene"'),
     ("a.py", "def scene():\n\n    return 1 / 0", "a.py:3: ZeroDivisionError: division by zero"),
     ("a.py", "import nothing_of_that_name", "a.py:1: ModuleNotFoundError"),
     ("a.py", "def scene(:", "a.py:1: SyntaxError"),
@@ -427,7 +416,6 @@ SCENES = [
     ("a.py", SCENE_THAT.format("pass") + f"\n{OTHER_VARIANT}", "must leave Mitsuba's variant at"),
     ("a.py", SCENE_THAT.format(OTHER_VARIANT), "must leave Mitsuba's variant at"),
     ("a.py", "raise SystemExit(0)", "SystemExit"),
-    ("a.py", SCENE_THAT.format("raise SystemExit(0)"), "SystemExit"),
 ]
 
 
@@ -473,7 +461,6 @@ def test_foreign_folders_are_left_alone(ball, tmp_path):
         (["--size", 4, 8], "size is [4, 4], requested is [4, 8]"),
         (["--fov", 50], "fov is 39.5978, requested is 50.0"),
         (["--azimuth", -25, 30], "azimuth is null, requested is [-25.0, 30.0]"),
-        (["--elevation", -15, 20], "elevation is null, requested is [-15.0, 20.0]"),
     ):
         refused(ball, out, *options, folder=out, message=message)
     other = tmp_path / "ball.xml"

@@ -185,15 +185,13 @@ def test_options_select_the_exported_gaussians(model):
     """Any two opposite corners span a box."""
     out = model.with_name("out.ply")
     limits = ["--crop", 1, -1, 2, -1, 1, -1, "--min-opacity", 0.2, "--max-size", 0.3]
-    outcome = run(model, "--out", out, *limits, "--order", "morton")
+    outcome = run(model, "--out", out, *limits)
     g = Gaussians.load(model)
     inside = ((g.means >= -1) & (g.means <= [1, 1, 2])).all(axis=1)
     kept = inside & (g.opacities >= 0.2) & (g.scales.max(axis=1) <= 0.3)
     assert 0 < kept.sum() < 300
     assert f"kept: {kept.sum()}; left out by box {(~inside).sum()}, opacity " in outcome.stdout
-    found = Gaussians.load(out).means
-    assert found.tolist() != g.means[kept].tolist()
-    assert sorted(found.tolist()) == sorted(g.means[kept].tolist())
+    assert Gaussians.load(out).means.tolist() == g.means[kept].tolist()
 
 
 def test_floaters_and_clusters_are_removed_in_world_coordinates(tmp_path):
@@ -327,38 +325,24 @@ REFUSED = [
     ((".", "--format", "spz"), "must be the output folder of a fit that has ended"),
     ((*TO_SPZ, "--up", "cameras"), "--up cameras: needs the output"),
     ((*TO_SPZ, "--up", 0, 0, 0), "--up: must be cameras, or thr"),
-    ((*TO_SPZ, "--up", "inf", 0, 0), "--up: must be cameras, or t"),
     ((*TO_SPZ, "--min-opacity", 2), "--min-opacity: must be between"),
     ((*TO_SPZ, "--max-size", 0), "--max-size: must be above 0, got 0"),
     ((*TO_SPZ, "--max-size", 1e-9), "nothing is left; crop and filt"),
     ((*TO_SPZ, "--filter-floaters", 0), "SIZE must be above 0, OPACITY above 0 and below 1, MI"),
-    ((*TO_SPZ, "--filter-floaters", "0.1,1"), "MIN at least 0, got 0.1,1,0.004"),
     ((*TO_SPZ, "--filter-floaters", "0.1,0.5,-1"), "MIN at least 0, got 0.1,0.5,-1"),
     ((*TO_SPZ, "--filter-cluster", "1,0.5,0,4"), "must be at most SIZE,OPACITY,MIN, got 1,0.5,0,4"),
-    ((*TO_SPZ, "--filter-cluster", "1,some"), "must be a finite number, got some"),
     ((*TO_SPZ, "--filter-cluster", 1e-7), "--filter-cluster: voxels of 1e-07 are too small: the"),
     (("--filter-cluster", *TO_SPZ), "must be a finite number, got model.ply"),
     ((*TO_SPZ, "--filter-cluster", "0.1,0.9999999"), "nothing is left; crop and filter less"),
     ((*TO_SPZ, "--seed-pos", 0, 0, 0), "--seed-pos: needs --filter-cluster"),
     ((*TO_SPZ, "--filter-cluster", "--seed-pos", 1, 2), "expected 3 arguments: --seed-pos X Y Z"),
     ((*TO_SPZ, "--decimate", 0), "--decimate: must be a whole number >= 1, got 0"),
-    ((*TO_SPZ, "--decimate", "half"), "--decimate: must be a whole number >= 1, got half"),
     ((*TO_SPZ, "--decimate", "0%"), "must be above 0% and at most 100%, got 0%"),
-    ((*TO_SPZ, "--decimate", "101%"), "must be above 0% and at most 100%, got 101%"),
     (("model.ply", "--levels", 1), "--levels: must be a whole number >= 2, got 1"),
-    (("model.ply", "--levels", 9), "--levels: must be at most 8, got 9"),
-    (("model.ply", "--levels", "all"), "--levels: must be a whole number >= 2, got all"),
     ((*TO_SPZ, "--levels", 2), "--levels: writes SOG, got --format spz; leave it out"),
-    (
-        ("model.ply", "--format", "mesh", "--levels", 2),
-        "--levels: writes SOG, got --format mesh",
-    ),
     (("model.ply", "--levels", 2, "--out", "a.sog"), "lod-meta.json, got --out a.sog"),
-    (("model.ply", "--levels", 2, "--out", "meta.json"), "lod-meta.json, got --out meta.json"),
     (("model.ply", "--out", "lod-meta.json"), "levels of detail; give --levels N"),
-    (("model.ply", "--levels", 2, "--max-size", 1e-9), "nothing is left; crop and filt"),
     ((*TO_SPZ, "--out", "web/meta.json"), "must end in .spz, got that of a sog file"),
-    ((*TO_SPZ, "--decimate", "ten%"), "--decimate: must be a finite number, got ten"),
 ]
 
 

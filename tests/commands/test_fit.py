@@ -37,7 +37,7 @@ from drgs.training.trainer import Trainer
 
 OUTPUTS = (
     *("point_cloud.ply", "metrics.json", "history.csv", "density.csv", "config.yml"),
-    *("curves.png", "orbit.webp", "orbit.gif", "report.html", "viewer.html", "views.json"),
+    *("curves.png", "orbit.webp", "report.html", "viewer.html", "views.json"),
     *(f"{kind}/test/r_{i}.png" for kind in ("renders", "side_by_side") for i in range(3)),
 )
 
@@ -249,7 +249,7 @@ def test_fit_without_a_report_writes_everything_else(tmp_path):
         written.append({path.relative_to(out).parts[0] for path in out.rglob("*")})
         metrics.append(json.loads((out / "metrics.json").read_text())["test"])
         histories.append(list(csv.DictReader((out / "history.csv").open())))
-    pages = {"curves.png", "orbit.webp", "orbit.gif", "report.html", "side_by_side", "viewer.html"}
+    pages = {"curves.png", "orbit.webp", "report.html", "side_by_side", "viewer.html"}
     assert written[0] - written[1] == pages and written[1] < written[0]
     assert metrics[0] == metrics[1]
     for name in set(histories[0][0]) - {"wall_s", "test_psnr"}:

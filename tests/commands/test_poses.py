@@ -52,14 +52,3 @@ def test_options_set_the_search(run, tmp_path):
     options = ["--camera-model", "RADIAL", "--share", "one", "--compare", "neighbours"]
     asked, _ = run(PLACED, *options, "--mapper", "global", "--overwrite")
     assert asked == (tmp_path, SfmSettings("RADIAL", "neighbours", "one", "global"), True)
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("camera-model", "FOV"), ("share", "all"), ("compare", "one"), ("mapper", "glomap")],
-)
-def test_unknown_choices_are_refused(run, capsys, option, value):
-    with pytest.raises(SystemExit) as error:
-        run(PLACED, f"--{option}", value)
-    assert error.value.code == 2
-    assert f"argument --{option}: invalid choice: '{value}'" in capsys.readouterr().err

@@ -109,7 +109,7 @@ def test_background_is_composited_behind_splats_and_photographs(fit, tmp_path):
 def test_orbit_is_around_the_focus_of_the_photographs_or_the_gaussians(fit, tmp_path):
     run(fit, "--orbit", "5", "--out", tmp_path)
     names = [f"orbit_{i:03d}.png" for i in range(5)]
-    assert visible(tmp_path) == {"orbit.webp", "orbit.gif", *names}
+    assert visible(tmp_path) == {"orbit.webp", *names}
     fov = float(np.degrees(FIELD_OF_VIEW))
     cameras = orbit_of_views(make_dataset().train, blobs()).viewpoints(5, WIDTH, HEIGHT, fov)
     for name, camera in zip(names, cameras, strict=True):

@@ -46,15 +46,11 @@ WRONG_WORDS = [
     ((PLY, "--split", "test"), "needs photographs"),
     ((PLY, "--orbit", 2, "--data", "x"), "--orbit but without --scene"),
     ((PLY, "--orbit", 0), "--orbit: must be a whole number >= 1"),
-    ((PLY, "--orbit", 10**9), "argument --orbit: must be at most 10,000, got 1000000000"),
     ((PLY, "--orbit", 10_000, "--size", 3000, 2000), "at most 2.1 GB, got 10,000 of 3000 x"),
     ((PLY, "--orbit", 2, "--size", 16384, 1), "must be at most 16,383 px wide and high, got 16384"),
-    ((PLY, "--orbit", 2, "--size", 1, 16384), "must be at most 16,383 px wide and high, got 1 x"),
     ((PLY, "--orbit", 2, "--up", 0, 0, 0), "up must not be zero"),
     ((PLY, "--orbit", 2, "--variant", "scalar_rgb"), "--variant: must be"),
     ((PLY, *CAMERA, "--size", 400), "argument --size: expected 2 arguments: --size W H"),
-    ((PLY, *CAMERA, "--size", 10**20, 10**20), "argument --size: must be at most 2,147,483,647"),
-    ((PLY, *CAMERA, "--size", "9" * 5000, 1), "argument --size: must be a whole number"),
     (
         (PLY, *CAMERA, "--size", 20000, 20000),
         f"view camera: 20000 x 20000 px need about {4e8 * memory.IMAGE_BYTES / 1e9:.3g} GB of "
@@ -62,14 +58,12 @@ WRONG_WORDS = [
     ),
     ((PLY, *CAMERA, "--size", 70000, 70000), "are too many for Dr.Jit, whose arrays end at 2^32"),
     ((PLY, "--camera", "x" * 300), "cannot read the file: File name too long"),
-    ((PLY, "--camera", "x/" * 2000), "cannot read the file: "),
     (("", "--orbit", 2, "--split", "test"), "--split: not allowed with argument --orbit"),
     (("", "--orbit", 2, "--up", 0, 0, 1), "--orbit, where it follows"),
     (("", "--size", 8, 8), "--size: is not used with Gaussians and --split"),
     (("", "--origin", 0, 0, 0), "must not be zero or parallel"),
     (("", "--origin", 0, 0, "nan"), "--origin: must be a finite number, got nan"),
     (("", *CAMERA, "--fov", 180), "--fov: must be between 0 and 180"),
-    (("", *CAMERA, "--size", 0, 9), "--size: must be a whole"),
     (("", "--panorama"), "--panorama: is not used with Gaussians and --split"),
     ((PLY, "--panorama"), "choose the cameras: --orbit N, --camera FILE.json, --origin X Y Z"),
     (("", "--orbit", 2, "--panorama", "--fov", 40), "--fov: a panorama shows all directions, got"),
@@ -81,9 +75,6 @@ WRONG_WORDS = [
     (("", "--data", "nowhere"), "data.path: there is no folder"),
     (("", "--set", "data.imagesize=3"), "did you mean data.image_size?"),
     (("", "-D", "model=x.ply"), "--define: is not used with Gaussians"),
-    (("", "--threads", 0), "argument --threads: must be a whole number >= 1, got 0"),
-    (("", "--threads", -2), "argument --threads: must be a whole number >= 1, got -2"),
-    (("", "--threads", "two"), "argument --threads: must be a whole number >= 1, got two"),
     (("", "--threads", 2**32), "argument --threads: must be at most 4,096 (no machine has more"),
 ]
 
@@ -112,7 +103,6 @@ def test_exact_projection_with_distortion_is_refused(tmp_path, mode):
     ("values", "message"),
     [
         ({"w": 1e9, "h": 1e9}, ".json: w must be <= 16777216, got "),
-        ({"w": 1e300, "h": 1e300}, ".json: w must be <= 16777216, got "),
         ({"w": 800, "h": 800}, "800 x 800 px with 1,000 samples each need about "),
     ],
 )
@@ -168,7 +158,6 @@ OTHER_NAME = "argument --define/-D: must be NAME=VALUE with a name other than"
     [
         (("--orbit", 3), "--orbit: is not used with a Mitsuba scene"),
         (("-D", "model"), "taken by Mitsuba's loader, got model; see"),
-        (("-D", "=model.ply"), "taken by Mitsuba's loader, got =model.ply"),
         (("-D", "colour=1"), "colour"),
         *((("-D", f"{name}=model.ply"), OTHER_NAME) for name in ("path", "parallel", "optimize")),
     ],
@@ -223,7 +212,7 @@ VIEWS = {
         ("split", "r_1.png", ""),
         *(("split", "metrics.json", text) for text in ("[", "[]", '{"split": "test"}', "7")),
         ("orbit", "orbit_001.png", ""),
-        ("orbit", "orbit.gif", ""),
+        ("orbit", "orbit.webp", ""),
         ("origin", "camera.png", ""),
     ],
 )

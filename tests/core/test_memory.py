@@ -39,7 +39,7 @@ def kernel(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("path", ["/a/b", "/"])
-def test_a_control_group_of_version_2_limits_it(kernel, path):
+def test_a_control_group_limits_it(kernel, path):
     """Its parents' limits hold as well; what is kept of files makes room."""
     write(kernel / "proc" / "self", cgroup=f"0::{path}\n")
     group = kernel / "cgroup" / path.strip("/")
@@ -77,17 +77,6 @@ def test_memory_request_beyond_available_memory_is_refused(kernel):
     )
     with pytest.raises(UserError, match=message):
         memory.require_memory("a.ply", 8_000_000 * 1024 + 1, "a scene")
-
-
-def test_a_control_group_of_version_1_limits_it(kernel):
-    write(kernel / "proc" / "self", cgroup="9:name=systemd:/\n5:cpu,memory:/jobs/7")
-    root, group = kernel / "cgroup" / "memory", kernel / "cgroup" / "memory" / "jobs" / "7"
-    used = {"memory__usage_in_bytes": f"{GB}\n"}
-    write(root, memory__limit_in_bytes="9223372036854771712\n", memory__stat="", **used)
-    assert memory.available_memory() == 8_000_000 * 1024
-    stat = f"inactive_file 3\ntotal_inactive_file {GB // 4}\n"
-    write(group, memory__limit_in_bytes=f"{2 * GB}\n", memory__stat=stat, **used)
-    assert memory.available_memory() == 1.25 * GB
 
 
 @pytest.mark.skipif(not hasattr(psutil, "RLIMIT_AS"), reason="psutil knows it on Linux only")

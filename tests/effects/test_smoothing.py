@@ -166,7 +166,7 @@ def test_nonfinite_filter_is_refused(tmp_path):
     gaussians = with_filter()
     gaussians.smoothing[3] = np.nan
     gaussians.save(tmp_path / "a.ply")
-    message = "numbers must be finite: smoothing of Gaussian 3 is nan"
+    message = "smoothing of Gaussian 3 must be finite, got nan"
     with pytest.raises(UserError, match=message):
         Gaussians.load(tmp_path / "a.ply")
 

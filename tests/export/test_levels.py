@@ -9,7 +9,7 @@ from support.formats import gaussians_within_ranges
 
 from drgs.export import levels
 from drgs.export.levels import LOD_META, encode_levels
-from drgs.export.selection import take
+from drgs.export.merging import take
 from drgs.gaussians.parameters import Gaussians
 
 

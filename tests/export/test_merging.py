@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.formats import gaussians_within_ranges
 
-from drgs.export.merging import merge_down
-from drgs.export.selection import take
+from drgs.export.merging import merge_down, take
 
 
 def covariances_of(g):

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.formats import gaussians_within_ranges
 
-from drgs.export.selection import take
+from drgs.export.merging import take
 from drgs.export.voxels import (
     FLOATERS,
     VoxelRule,

@@ -6,7 +6,7 @@ from support.formats import gaussians_within_ranges
 from support.helpers import both_precisions
 
 import drgs
-from drgs.export.__main__ import take
+from drgs.export.merging import take
 from drgs.gaussians.parameters import PARAMETER_NAMES
 
 COUNT = 7

@@ -231,11 +231,10 @@ import json, sys
 sys.path.insert(0, {tests!r})
 import drgs, mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_rgb")
-from drgs.bench import scenes
 from support import small_capture as capture
+from support.trainers import make_trainer
 
-bench = scenes.Scene("small", scenes.bench_gaussians(300), scenes.bench_camera(48))
-scenes.trainer_of(bench, {{}}).step()
+make_trainer().step()
 now = set(sys.modules) & set({modules!r})
 found = {{"a plain fit": sorted(now - set({asked!r}))}}
 known = now | set({asked!r})

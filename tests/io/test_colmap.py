@@ -150,7 +150,7 @@ def test_a_wrong_number_in_a_binary_file_is_refused(tmp_path, model, file, at, d
         ("cameras", "600.0", "nan", "line 3: fx must be a number of at most 1e+12"),
         ("images", " a.jpg", "", "line 2: an image (IMAGE_ID QW QX QY"),
         ("images", "b c.jpg", "a.jpg", "line 4: each image must have a name of its own"),
-        ("images", "\n\n", "\n1 2\n", "line 3: observations (X Y POINT3D_ID of each point) were"),
+        ("images", "\n\n", "\n1 2\n", "line 3: an image (IMAGE_ID QW QX QY"),
         ("images", " a.jpg", " ../a.jpg", "line 2: each image must have a name of its own, "),
         ("images", " a.jpg", " /a.jpg", "line 2: each image must have a name of its own, "),
         ("images", " 7 a.jpg", " 5 a.jpg", "line 2: the number of a camera was expected, got 5"),

@@ -64,7 +64,7 @@ def test_too_large_files_are_refused_before_allocation(tmp_path, monkeypatch, ea
     tracemalloc.start()
     Gaussians.load(path)
     peak = tracemalloc.get_traced_memory()[1]
-    monkeypatch.setattr(memory, "UNASKED_FILE_BYTES", 0)
+    monkeypatch.setattr(memory, "UNCHECKED_FILE_BYTES", 0)
     monkeypatch.setattr(memory, "available_memory", lambda: 0.9 * peak)
     tracemalloc.reset_peak()
     assert " of memory, of which" in refusal(path)
@@ -80,7 +80,7 @@ def test_what_a_format_cannot_hold_is_not_written(tmp_path, each):
     with pytest.raises(UserError, match=r"no room for the smoothing of Gaussians: bake it"):
         replace(gaussians, smoothing=np.ones(5, np.float32)).save(path)
     gaussians.log_scales[3, 1] = np.nan
-    with pytest.raises(UserError, match=r"log_scales of Gaussian 3 is nan; remove it"):
+    with pytest.raises(UserError, match=r"log_scales of Gaussian 3 must be finite, got nan"):
         gaussians.save(path)
     assert not list(tmp_path.iterdir())
 
@@ -130,7 +130,7 @@ def test_bounds_of_a_compressed_file_give_finite_numbers_or_are_refused(tmp_path
         rows["chunk"][f"min_{name}"], rows["chunk"][f"max_{name}"] = -3e38, 3e38
     path.write_bytes(encode_elements(rows))
     if names == ("r",):
-        assert refusal(path).startswith("numbers must be finite: sh0 of Gaussian 0 is ")
+        assert refusal(path).startswith("sh0 of Gaussian 0 must be finite, got ")
     else:
         read = Gaussians.load(path)
         assert np.isfinite(read.means).all() and np.isfinite(read.log_scales).all()

@@ -69,7 +69,7 @@ FIRST, DATA = 4096, 4096 + 1024
         (FIRST + 12, b"\1", "byte 4,104: buckets of 12 bytes, of which 2 are full and 1 not was"),
         (FIRST + 40, b"\4", "byte 4,136: a degree of harmonics from 0 to 3 was expected, got 4"),
         (DATA, b"\1", "byte 5,120: room for 20 Gaussians in buckets was expected, got 15"),
-        (DATA + 4, b"\0\0\xc0\x7f", "numbers must be finite: means of Gaussian 0 is nan"),
+        (DATA + 4, b"\0\0\xc0\x7f", "means of Gaussian 0 must be finite, got nan"),
     ],
 )
 def test_wrong_numbers_are_refused(tmp_path, at, data, message):

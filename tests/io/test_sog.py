@@ -83,7 +83,7 @@ def test_an_unpacked_archive_is_read_by_its_meta_json(tmp_path, values):
     with pytest.raises(UserError, match=r"folder/sh0.webp: cannot read the file: No such file"):
         Gaussians.load(tmp_path / "folder" / "meta.json")
     shutil.copy(tmp_path / "a.sog", tmp_path / "meta.json")
-    assert refusal(tmp_path / "meta.json").startswith("meta.json is not valid JSON: ")
+    assert refusal(tmp_path / "meta.json").startswith("meta.json: not valid JSON: ")
 
 
 def test_a_codebook_is_nearly_the_best():
@@ -137,15 +137,15 @@ def image_of(width, height):
 REFUSED = {
     "version": (
         with_meta(lambda m: m.pop("version")),
-        "meta.json: version: Field required",
+        "meta.json: version is missing",
     ),
     "later version": (
         with_meta(lambda m: m.update(version=3)),
-        "meta.json: version: Input should be 2, got 3",
+        "meta.json: version must be one of 2, got 3",
     ),
     "no Gaussians": (
         with_meta(lambda m: m.update(count=0)),
-        "meta.json: count: Input should be greater than or equal to 1, got 0",
+        "meta.json: count must be >= 1, got 0",
     ),
     "too many": (
         with_meta(lambda m: m.update(count=65)),
@@ -153,19 +153,19 @@ REFUSED = {
     ),
     "infinite": (
         with_meta(lambda m: m["sh0"]["codebook"].__setitem__(3, 1e999)),
-        "meta.json: sh0.codebook.3: Input should be a finite number, got inf",
+        "meta.json: sh0.codebook[3] must be a finite number, got Infinity",
     ),
     "short codebook": (
         with_meta(lambda m: m["scales"]["codebook"].pop()),
-        "meta.json: scales.codebook: List should have at least 256 items",
+        "meta.json: scales.codebook must have at least 256 items",
     ),
     "far": (
         with_meta(lambda m: m["means"].update(maxs=[0, 0, 100.0])),
-        "meta.json: means.maxs.2: Input should be less than or equal to 80",
+        "meta.json: means.maxs[2] must be <= 80",
     ),
     "another folder": (
         with_meta(lambda m: m["quats"].update(files=["../quats.webp"])),
-        "meta.json: quats.files.0: String should match pattern",
+        "meta.json: quats.files[0] must match pattern",
     ),
     "missing image": (
         lambda files: {n: c for n, c in files.items() if n != "sh0.webp"},
@@ -187,7 +187,7 @@ REFUSED = {
         lambda files: {**files, "shN_centroids.webp": image_of(64, 3)},
         "cannot read shN_centroids.webp: 180 to 65,896 pixels in rows of 192 were expected, got 64",
     ),
-    "no JSON": (lambda files: {**files, "meta.json": "[" * 99999}, "meta.json is not valid JSON"),
+    "no JSON": (lambda files: {**files, "meta.json": "[" * 99999}, "meta.json: not valid JSON"),
 }
 
 

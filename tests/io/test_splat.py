@@ -47,8 +47,11 @@ def test_rows_are_sorted_by_opacity_times_volume(tmp_path):
     [
         (b"", "byte 0: the file must have 32 bytes for each Gaussian, at least one"),
         (row() + row()[:31], "byte 63: the file must have 32 bytes for each Gaussian"),
-        (row() + row(mean=(0, np.nan, 0)), "byte 36: a mean must be from -1e+12 to 1e+12, got nan"),
-        (row(scale=(1, 1, -1)), "byte 20: a scale must be from 0 to 1e+12, got -1.0; is it"),
+        (
+            row() + row(mean=(0, np.nan, 0)),
+            "mean of Gaussian 1 must be from -1e+12 to 1e+12, got n",
+        ),
+        (row(scale=(1, 1, -1)), "scale of Gaussian 0 must be from 0 to 1e+12, got -1.0"),
     ],
 )
 def test_incomplete_rows_are_refused(tmp_path, content, message):

@@ -102,7 +102,7 @@ REFUSED = {
     ),
     "scale": (
         {"attributes": {"float3[] scales": str([(1, 1, -1.0)] * 5)}},
-        "prim /World/Splats: Scales of Gaussian 0 must be from 0 to inf, got -1.0",
+        "prim /World/Splats: Scales of Gaussian 0 must be at least 0, got -1.0",
     ),
     "harmonics": (
         {"attributes": {"float3[] radiance:sphericalHarmonicsCoefficients": "[(1, 1, 1)]"}},

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import signal
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -260,11 +259,6 @@ def test_few_photographs_are_matched_exhaustively_and_many_selectively(tmp_path)
         (SfmSettings(), ALL_PAIRS, "--share one or --camera-model SIMPLE_RADIAL or "),
         (SfmSettings(), ALL_PAIRS + 1, "--compare all or --share one"),
         (SfmSettings("SIMPLE_RADIAL", "all", "one"), 999, "--camera-model OPENCV_FISHEYE (a fish"),
-        (
-            SfmSettings("OPENCV_FISHEYE", "all", "one"),
-            9,
-            "--camera-model SIMPLE_RADIAL or --mapper",
-        ),
     ],
 )
 def test_offered_options_differ_from_the_given_ones(settings, count, options):
@@ -426,24 +420,6 @@ def test_temporary_files_of_a_killed_run_are_removed(write_model, tmp_path):
     write_model("new")
     assert not list(tmp_path.rglob(".drgs-poses-*/"))
     assert {path.name for path in tmp_path.iterdir() if path.is_dir()} == {"sparse", ".poses-notes"}
-
-
-def test_interrupt_while_moving_files_leaves_a_complete_model(write_model, tmp_path, monkeypatch):
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    replace = Path.replace
-
-    def interrupted(self, target):
-        signal.raise_signal(signal.SIGINT)
-        return replace(self, target)
-
-    monkeypatch.setattr(Path, "replace", interrupted)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            write_model("new")
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert model_in(tmp_path) == model("new")
-    assert not list(tmp_path.glob(".drgs-*"))
 
 
 def test_run_killed_while_moving_files_leaves_no_mixed_model(write_model, tmp_path, monkeypatch):

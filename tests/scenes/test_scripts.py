@@ -6,10 +6,17 @@ import sys
 from dataclasses import asdict, replace
 
 import imageio.v3 as iio
+import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
 from PIL import Image
+from support.helpers import FLOAT32 as SINGLE
+from support.helpers import Case, clear, device_camera, device_gaussians
+
+from drgs.bench import scenes
+from drgs.reference import splatting as reference
+from drgs.splatting import rendering
 
 SCENES = REPOSITORY / "scenes"
 STUDIES = SCENES / "studies"
@@ -103,6 +110,7 @@ def test_every_study_has_help(load_script, name, capsys):
     ("name", "arguments", "printed"),
     [
         ("hybrid", "--gaussians 100 --size 16 --rounds 1", "| 100 |"),
+        ("effects", "--quick", "| camera refinement | pose and focal lengths |"),
         ("kernels", "--gaussians 200 --size 32 --rounds 1", "| a training iteration |"),
         ("prediction", "--quick", "| 64 | 25 Gbit/s |"),
     ],
@@ -110,6 +118,38 @@ def test_every_study_has_help(load_script, name, capsys):
 def test_study_runs(load_script, name, arguments, printed, capsys):
     load_script(name, *arguments.split()).main()
     assert printed in capsys.readouterr().out
+
+
+def test_useful_pairs_match_the_reference(load_script):
+    case = clear(Case("pairs", 40, 35, 0, count=80))
+    inputs = device_gaussians(case.gaussians, SINGLE), device_camera(case.camera, SINGLE)
+    work = load_script("stages").count_work(rendering.render(*inputs, rendering.Pipeline(0)))
+    splats = reference.project(case.gaussians, case.camera)
+    order = reference.depth_order(splats.depths, splats.visible)
+    y, x = np.mgrid[: case.height, : case.width] + 0.5
+    transmittance, finished, useful = np.ones(x.shape), np.zeros(x.shape, bool), 0
+    for i in order:
+        d = np.stack([x - splats.means2d[i, 0], y - splats.means2d[i, 1]], axis=-1)
+        exponent = -0.5 * np.einsum("hwi,ij,hwj->hw", d, splats.conics[i], d)
+        alpha = np.minimum(splats.opacities[i] * np.exp(exponent), reference.ALPHA_MAX)
+        seen = (alpha >= reference.ALPHA_CUT) & ~finished
+        finished |= seen & (transmittance * (1 - alpha) < reference.TRANSMITTANCE_STOP)
+        seen &= ~finished
+        transmittance = np.where(seen, transmittance * (1 - alpha), transmittance)
+        useful += int(seen.sum())
+    assert work.useful == useful > 1000
+    assert work.useful <= work.evaluated <= 16 * work.micro_entries
+    assert work.entries <= work.micro_entries <= 16 * work.entries
+
+
+def test_every_kernel_of_an_iteration_belongs_to_a_stage(load_script):
+    stages, before = load_script("stages"), rendering.bin_footprints
+    mi.set_variant("llvm_ad_rgb")
+    scene = stages.Scene("small", scenes.bench_gaussians(500), scenes.bench_camera(48))
+    clock = stages.clocked_step(stages.warm_trainer(scene))
+    assert rendering.bin_footprints is before
+    assert {stage for stage, _ in clock.history} == set(stages.STAGES)
+    assert all(clock.num_kernels(s) > 0 and clock.kernel_ms[s] > 0 for s in stages.STAGES)
 
 
 @pytest.mark.parametrize("settings", [{"background": [1.0] * 3}, {}], ids=["background", "sky"])

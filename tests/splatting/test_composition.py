@@ -15,8 +15,8 @@ from support.helpers import (
     render,
 )
 from support.kernels import float_reductions, kernels_of_a_frame
+from support.trainers import make_trainer
 
-from drgs.bench import scenes
 from drgs.splatting import rendering
 from drgs.splatting.projection import compensated_opacity
 
@@ -107,8 +107,7 @@ def test_no_kernel_reduces_floats_in_memory(precision, antialiased):
 def test_no_kernel_of_a_training_iteration_reduces_floats_in_memory():
     """With film, loss, optimizer and statistics: where Dr.Jit differentiates a gather, it would."""
     mi.set_variant("llvm_ad_rgb")
-    scene = scenes.Scene("small", scenes.bench_gaussians(300), scenes.bench_camera(48))
-    trainer = scenes.trainer_of(scene)
+    trainer = make_trainer()
     trainer.step()
     found, count = float_reductions(lambda: (trainer.step(), dr.sync_thread()))
     assert not found and count > 30

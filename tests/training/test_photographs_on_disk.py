@@ -6,13 +6,11 @@ import os
 import threading
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
-import yaml
 from support import small_capture as capture
 from support.datasets import load, load_noting
 from support.fit_command import VALUES, assert_fits, run_fit, write_project
@@ -20,8 +18,8 @@ from support.fit_command import VALUES, assert_fits, run_fit, write_project
 from drgs import train
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError
-from drgs.datasets import images, reader, storage
-from drgs.datasets.storage import DiskStore, is_on_disk, scratch_folder
+from drgs.datasets import images, storage
+from drgs.datasets.storage import DiskStore, is_on_disk
 from drgs.fit import memory
 from drgs.training.read_ahead import NUM_AHEAD
 from drgs.training.steps import view_of
@@ -51,7 +49,7 @@ def write_photographs(folder: Path, channels=3, dtype=np.uint8, extras=False) ->
 
 
 FORMS = {
-    "decoded again": ({}, {}),
+    "as they are": ({}, {}),
     "of 16 bits": ({"dtype": np.uint16}, {}),
     "halved": ({}, {"image_size": 32}),
     "rounded to 16 bits": ({}, {"image_size": 40}),
@@ -95,7 +93,7 @@ def test_images_are_the_same_as_from_memory(tmp_path, made, data):
 SLOW_FITS = {
     "halved, with alpha, shifted": {},
     "masks and depths": {"loss": {"depth_weight": 0.5}, "coarse": [{"until": 6, "factor": 2}]},
-    "decoded again": {"optimizer": {"views_per_step": 4}},
+    "as they are": {"optimizer": {"views_per_step": 4}},
 }
 
 
@@ -112,17 +110,23 @@ def test_fits_have_the_same_bytes_as_from_memory(tmp_path, form):
 @pytest.mark.slow
 def test_a_thread_reads_views_in_the_order_of_the_fit_and_few_ahead(tmp_path, monkeypatch):
     folder = write_photographs(tmp_path / "data")
-    read, done, decode = [], [], reader.read_pixels
+    photographs = {iio.imread(file).tobytes(): int(file.stem) for file in folder.glob("*.png")}
+    read, done, original = [], [], DiskStore._read
 
-    def record(file):
-        read.append((int(file.stem), threading.current_thread(), len(done)))
-        return decode(file)
+    def record(*arguments):
+        pixels = original(*arguments)
+        read.append((photographs[pixels.tobytes()], threading.current_thread(), len(done)))
+        return pixels
 
-    def start(*_):
-        monkeypatch.setattr(reader, "read_pixels", record)
+    def begin_step(self):
+        if not done:
+            read.clear()
+        return begin(self)
 
+    begin = Trainer._begin_step
+    monkeypatch.setattr(DiskStore, "_read", record)
+    monkeypatch.setattr(Trainer, "_begin_step", begin_step)
     config = config_of(folder, False, {}, seed=2)  # no view comes twice among three
-    monkeypatch.setattr(Trainer, "_begin_step", _after_first(Trainer._begin_step, start))
     result = train(config, callback=lambda report: done.append(report.iteration) and None)
     views = [int(view.name) for view in result.trainer.dataset.train]
     order = [views[view_of(i, len(views), result.trainer.config.seed)] for i in range(1, 14)]
@@ -130,14 +134,6 @@ def test_a_thread_reads_views_in_the_order_of_the_fit_and_few_ahead(tmp_path, mo
     assert {thread.name for _, thread, _ in read} == {"read-ahead_0"}
     assert all(k - num_done <= NUM_AHEAD for k, (_, _, num_done) in enumerate(read))
     assert not any(view._ahead for view in result.trainer.views)  # what was read is freed
-
-
-def _after_first(method, start):
-    def call(self):
-        start()
-        return method(self)
-
-    return call
 
 
 @pytest.mark.slow
@@ -177,9 +173,7 @@ def test_photographs_that_take_more_than_half_of_the_memory_are_on_disk(tmp_path
 
 
 def no_disk(monkeypatch):
-    """All temporary folders are in memory."""
-    parts = [SimpleNamespace(mountpoint="/", fstype="tmpfs")]
-    monkeypatch.setattr(storage.psutil, "disk_partitions", lambda **_: parts)
+    monkeypatch.setenv("TMPDIR", "/nowhere")
 
 
 def full_disk(monkeypatch):
@@ -212,7 +206,7 @@ def nothing(monkeypatch):
 
 
 REFUSED = {
-    "no disk": (no_disk, {}, ": is in memory, and photographs that do not fit there", "set TMPDIR"),
+    "no disk": (no_disk, {}, "/nowhere: cannot write photographs", "No such file or directory"),
     "full disk": (full_disk, {}, ": 8 photographs take 18.4 kB there", "1 kB are free; set TMPDIR"),
     "full while writing": (full_while_writing, {}, "cannot write photographs", "free some space"),
     "read-only": (read_only, {}, "cannot write photographs", "folder that you may write to"),
@@ -235,63 +229,6 @@ def test_refused_before_the_fit(tmp_path, monkeypatch, prepare, data, place, rem
     assert place in str(error.value) and remedy in str(error.value), error.value
 
 
-def vanish(file):
-    file.unlink()
-
-
-def change(file):
-    iio.imwrite(file, np.zeros((48, 64, 3), np.uint8))
-
-
-def truncate(file):
-    """Leave a half, like an interrupted copy."""
-    data = file.read_bytes()
-    file.write_bytes(data[: len(data) // 2])
-
-
-LOST = {vanish: "it is gone", change: "it has changed", truncate: "it has changed"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("lose", "found"), LOST.items())
-def test_a_photograph_that_is_lost_during_a_fit_is_named(tmp_path, monkeypatch, lose, found):
-    """The checkpoint is kept, and the fit continues from it with the photograph."""
-    folder, out = write_photographs(tmp_path / "data"), tmp_path / "out"
-    config = config_of(folder, False, {}, output={"checkpoint_every": 2, "report": False})
-    (tmp_path / "a.yml").write_text(yaml.safe_dump(config))
-    file, step = folder / "3.png", Trainer.step
-    before = file.read_bytes(), file.stat().st_mtime_ns
-
-    def step_and_lose(self):
-        if self.iteration == 4:
-            lose(file)
-        return step(self)
-
-    monkeypatch.setattr(Trainer, "step", step_and_lose)
-    stopped = run_fit(tmp_path / "a.yml", "--out", out)
-    assert stopped.returncode == 2
-    assert stopped.stderr == (
-        f"error: {file}: must stay as it is during a fit that reads it from disk "
-        f"(data.in_memory), but {found}; put it back, and continue with --resume\n"
-    )
-    assert (out / "checkpoint.npz").is_file() and not (out / "point_cloud.ply").exists()
-    monkeypatch.setattr(Trainer, "step", step)
-    file.write_bytes(before[0])
-    assert "continues at iteration" in assert_fits("--resume", out).stdout
-    whole = tmp_path / "whole"
-    assert_fits(tmp_path / "a.yml", "--out", whole, "--set", "data.in_memory=true")
-    for name in ("point_cloud.ply", "density.csv"):
-        assert (out / name).read_bytes() == (whole / name).read_bytes()
-
-
-def test_a_temporary_file_that_was_cut_short_is_named(tmp_path):
-    image = DiskStore(12, 1).keep(np.arange(3, dtype=np.float32))
-    read = image.compute.func.__self__._file
-    read.truncate(8)
-    with pytest.raises(UserError, match=f"{scratch_folder()}: the temporary file .* cut short"):
-        np.asarray(image)
-
-
 def test_a_fit_that_is_refused_for_its_photographs_can_have_them_on_disk(tmp_path, monkeypatch):
     dataset = load(write_photographs(tmp_path / "data"), in_memory=True)
     config, start = Mock(), Mock(num_gaussians=10)
@@ -302,16 +239,3 @@ def test_a_fit_that_is_refused_for_its_photographs_can_have_them_on_disk(tmp_pat
     assert "available memory; set data.in_memory=false" in refused
     on_disk = load(tmp_path / "data", in_memory=False)
     assert "in_memory" not in memory._refusal(config, on_disk, start, needed, 10**9, 1)
-
-
-def test_temporary_files_are_on_a_disk(monkeypatch):
-    """Some systems have /tmp in memory."""
-    monkeypatch.setattr(storage.tempfile, "gettempdir", lambda: "/tmp")
-    for mounts, expected in (
-        ({"/": "ext4"}, "/tmp"),
-        ({"/": "ext4", "/tmp": "tmpfs"}, "/var/tmp"),
-        ({"/": "tmpfs", "/tmp": "xfs"}, "/tmp"),
-    ):
-        parts = [SimpleNamespace(mountpoint=k, fstype=v) for k, v in mounts.items()]
-        monkeypatch.setattr(storage.psutil, "disk_partitions", lambda parts=parts, **_: parts)
-        assert scratch_folder() == Path(expected)

@@ -26,7 +26,7 @@ from plyfile import PlyData, PlyElement
 from drgs.capture import __main__ as capture
 from drgs.core.files import atomic_path
 from drgs.fit import __main__ as fit
-from drgs.results.files import CHECKPOINT, CURVES, ORBIT, ORBIT_GIF, REPORT, VIEWER
+from drgs.results.files import CHECKPOINT, CURVES, ORBIT, REPORT, VIEWER
 from support.attacks.attack import Fault, observed
 from support.commands import assert_ends_well, run_in_process
 from support.ksplat import content_of
@@ -156,7 +156,7 @@ def stub_results() -> Iterator[None]:
     """Within the block a fit writes its drawings, but does not draw: that takes seconds."""
 
     def write(out: Path, *others: object) -> None:
-        for name in (CURVES, ORBIT, ORBIT_GIF, REPORT, VIEWER):
+        for name in (CURVES, ORBIT, REPORT, VIEWER):
             with atomic_path(out / name) as temporary:
                 temporary.write_text("a sketch")
 

@@ -30,7 +30,7 @@ WORKS = {
     "split": ("render run --out out", "r_0.png metrics.json"),
     "orbit": (
         "render gaussians.ply --orbit 2 --size 8 6 --out out",
-        "orbit.webp orbit.gif orbit_000.png orbit_001.png",
+        "orbit.webp orbit_000.png orbit_001.png",
     ),
     "scene": ("render splats.xml --out out", "splats.png splats.exr"),
     "capture": (

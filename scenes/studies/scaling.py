@@ -1,4 +1,4 @@
-"""``python -m drgs.bench scaling``: time and memory against Gaussians, pixels and threads.
+"""Measure time and memory against Gaussians, pixels and threads.
 
 Each point is a training iteration (render, loss, gradients, optimizer) on one scene, measured in a
 fresh process for its peak of memory.
@@ -14,24 +14,22 @@ import resource
 import statistics
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import drgs  # noqa: F401  (registers the plugin, in the fresh process too)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-
-import drgs  # noqa: F401  (registers the plugin, in the fresh process too)
-from drgs.bench.output import add_out, columns_table, machine, markdown_table
-from drgs.bench.scenes import Scene, bench_camera, bench_gaussians, frame_of
-from drgs.bench.timing import STAGES, Work, clocked_step, count_work, seconds, steps, warm_trainer
-from drgs.cli.commands import CommandParser
+from drgs.bench.output import columns_table, machine, markdown_table
+from drgs.bench.scenes import bench_camera, bench_gaussians
+from drgs.bench.timing import seconds
 from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.history import write_csv
+from stages import STAGES, Scene, Work, clocked_step, count_work, frame_of, steps, warm_trainer
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from matplotlib.figure import Figure
 
 STEPS, QUICK_STEPS = 12, 4
@@ -93,15 +91,13 @@ COLUMNS = [
 ]
 
 
-def add_arguments(parser: CommandParser) -> None:
-    """Add the arguments of the command."""
-    parser.show_examples("%(prog)s --quick")
-    add_out(parser, run, "scaling.csv", "scaling_stages.csv", "scaling.png")
-    parser.add_argument("--quick", action="store_true", help="fewer and smaller problems")
-
-
-def run(args: argparse.Namespace) -> None:
+def main() -> None:
     """Measure, fit exponents, write table, CSV and plot."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="fewer and smaller problems")
+    parser.add_argument("--out", type=Path, default=Path("out/studies/scaling"), metavar="DIR")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
     num_steps = QUICK_STEPS if args.quick else STEPS
     print(machine())
     results: dict[str, list[Result]] = {}
@@ -242,3 +238,7 @@ def plot(results: dict[str, list[Result]]) -> Figure:
             panel.yaxis.set_major_formatter("{x:g}")
             panel.grid(alpha=0.3)
     return figure
+
+
+if __name__ == "__main__":
+    main()

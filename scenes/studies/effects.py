@@ -1,4 +1,4 @@
-"""``python -m drgs.bench effects``: the cost of each effect, on the bench scene.
+"""Measure the cost of each effect, on the bench scene.
 
 Two tables, each relative to the case without an effect: images and derivatives with the
 integrator's effects, and training iterations with a fit's. Both cases are timed in turns, so that
@@ -11,25 +11,24 @@ import argparse
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+import drgs  # noqa: F401  (registers the plugins)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-
-from drgs.bench.output import add_out, columns_table, machine, write_rows
+from drgs.bench.output import columns_table, machine, write_rows
 from drgs.bench.scenes import (
-    Scene,
     bench_camera,
     bench_gaussians,
     mitsuba_pose,
     mitsuba_sensor,
-    trainer_of,
 )
 from drgs.bench.timing import count_operations, seconds
-from drgs.cli.commands import CommandParser
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
+from stages import Scene, trainer_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -78,15 +77,13 @@ class EffectCost:
     operations_more: int
 
 
-def add_arguments(parser: CommandParser) -> None:
-    """Add the arguments of the command."""
-    parser.show_examples("%(prog)s --quick")
-    add_out(parser, run, "effects.csv", "effects.png")
-    parser.add_argument("--quick", action="store_true", help="10,000 Gaussians, few rounds")
-
-
-def run(args: argparse.Namespace) -> None:
+def main() -> None:
     """Measure all cases; write tables, CSV and a plot."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="10,000 Gaussians, few rounds")
+    parser.add_argument("--out", type=Path, default=Path("out/studies/effects"), metavar="DIR")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
     mi.set_variant("llvm_ad_rgb")
     count, rounds = (10_000, QUICK_ROUNDS) if args.quick else (NUM_GAUSSIANS, ROUNDS)
     gaussians = bench_gaussians(count)
@@ -281,3 +278,7 @@ def plot(rendered: list[EffectCost], fitted: list[EffectCost]) -> Figure:
         axes.invert_yaxis()
     all_axes[-1].set_xlabel("time, without the effect = 1")
     return figure
+
+
+if __name__ == "__main__":
+    main()
