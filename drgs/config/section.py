@@ -65,7 +65,9 @@ class Section(BaseModel):
             return values
         for name, constant in cls.removed.items():
             if values.get(name, constant) != constant:
-                text = f"{format_value(constant)}, its only value since 0.1.0 (CHANGELOG.md)"
+                text = (
+                    f"must be {format_value(constant)}, its only value since 0.1.0 (CHANGELOG.md)"
+                )
                 error = ErrorDetails(type=text, loc=(name,), msg=text, input=values[name])
                 raise ValidationError.from_exception_data(name, [_error_details(error)])
         return {name: value for name, value in values.items() if name not in cls.removed}
