@@ -227,9 +227,10 @@ def random_scene(case: Case) -> Values:
 
 
 def _weights(case: Case) -> np.ndarray:
-    """Return random weights (5, H * W) of a loss; zero near thresholds and without a reference."""
+    """Return random weights (P, H * W) of a loss; zero near thresholds and without a reference."""
     planes = 5 if case.reference is None else len(case.reference_image[0])
-    weights = single(np.random.default_rng(2).normal(size=(5, case.width * case.height)))
+    shape = max(5, planes), case.width * case.height
+    weights = single(np.random.default_rng(2).normal(size=shape))
     weights[planes:] = 0
     return weights * ~case.near_threshold
 
@@ -275,7 +276,7 @@ def camera_gradients_equal_differences(case: Case) -> None:
     gaussians, frames = case.frames(case.values)
     for frame in frames:
         d_planes = [cast("Any", llvm.Float64(plane)) for plane in weights]
-        found = rendering.frames_adjoint(gaussians, [frame], [d_planes], of_camera=True).camera
+        found = rendering.frames_adjoint(gaussians, [frame], [d_planes], with_camera=True).camera
         gradient = _arrays(found or []).ravel()
         direction = single(np.random.default_rng(3).normal(size=len(gradient)))
 

@@ -15,9 +15,9 @@ from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.splatting.footprint import DEFAULT
 from drgs.splatting.grid import TileGrid
 from drgs.splatting.projection import load_rows
-from drgs.splatting.rasterize import Layers, Records, composite, composite_adjoint
+from drgs.splatting.rasterize import CompositedTiles, Records, composite, composite_adjoint
 from drgs.splatting.rendering import Pipeline, gradients_of
-from drgs.splatting.tiles import TileBins, bin_footprints, footprints_of
+from drgs.splatting.tiles import bin_splats, splat_table
 
 
 class MinimalSplatsIntegrator(mi.CppADIntegrator):
@@ -57,8 +57,8 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         develop: bool = True, evaluate: bool = True,
     ) -> mi.TensorXf:  # fmt: skip
         with dr.suspend_grad():
-            film, _, _, _, layers = self._composite(scene, sensor)
-            return develop_pixels(film, _channels(film, layers.planes()), [])
+            film, _, tiles = self._composite(scene, sensor)
+            return develop_pixels(film, _channels(film, tiles.planes()), [])
 
     @override
     def render_backward(
@@ -66,20 +66,20 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         sensor: int | mi.Sensor = 0, seed: int | mi.UInt32 = 0, spp: int = 0,
     ) -> None:  # fmt: skip
         with dr.suspend_grad():
-            film, camera, bins, records, layers = self._composite(scene, sensor)
-            planes = layers.planes()
+            film, camera, tiles = self._composite(scene, sensor)
+            planes = tiles.planes()
             with dr.resume_grad():  # colours are converted again, and differentiated by Dr.Jit
                 dr.enable_grad(planes)
                 channels = _channels(film, planes)
                 dr.accum_grad(channels, pixels_adjoint(film, {}, grad_in, []))
                 dr.enqueue(dr.ADMode.Backward, channels)
                 dr.traverse(dr.ADMode.Backward)
-                d_transmittance, *d_colors = dr.grad(planes)
-            of_splats = composite_adjoint(bins, records, layers, d_colors, d_transmittance)
-            found = gradients_of(self._gaussians, camera, self.pipeline, of_splats).parameters
+                d_planes = dr.grad(planes)
+            of_splats = composite_adjoint(tiles, d_planes)
+            gradients = gradients_of(self._gaussians, camera, self.pipeline, of_splats).parameters
         for name in PARAMETER_NAMES:
             if dr.grad_enabled(getattr(self, name)):
-                dr.accum_grad(getattr(self, name), getattr(found, name))
+                dr.accum_grad(getattr(self, name), getattr(gradients, name))
 
     @property
     def _gaussians(self) -> Gaussians:
@@ -87,16 +87,16 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
 
     def _composite(
         self, scene: mi.Scene, sensor: int | mi.Sensor
-    ) -> tuple[mi.Film, Camera, TileBins, Records, Layers]:
+    ) -> tuple[mi.Film, Camera, CompositedTiles]:
         """Project the Gaussians, sort them into tiles, and composite each tile's front to back."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         camera = camera_from_sensor(read_sensor(sensor, NEAR))
         rows = load_rows(self._gaussians, self.pipeline.sh_degree)
         splats = self.pipeline.project(rows, camera)
         grid = TileGrid(camera.width, camera.height)
-        bins = bin_footprints(footprints_of(splats, grid, list(splats.colors)), grid, DEFAULT)
-        records = Records.from_ranks(bins, bins.rows.load)
-        return sensor.film(), camera, bins, records, composite(bins, records)
+        bins = bin_splats(splat_table(splats, grid, list(splats.colors)), grid, DEFAULT)
+        tiles = composite(bins, Records.from_ranks(bins, bins.rows.load))
+        return sensor.film(), camera, tiles
 
 
 def _channels(film: mi.Film, planes: list[mi.Float]) -> list[mi.Float]:

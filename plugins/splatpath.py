@@ -15,14 +15,14 @@ from mitsuba.ad.integrators.common import (  # pyright: ignore[reportMissingImpo
 
 from drgs.core.environment import check_variant
 from drgs.core.errors import UnsupportedError
-from drgs.integrator.properties import flag, integer, read, refuse_unknown
-from drgs.integrator.rays import (
+from drgs.integrator.light.rays import (
     UNBOUNDED_DEPTH,
     PathSegment,
     SplatTransport,
     StraightRays,
     has_transparent_parts,
 )
+from drgs.integrator.properties import flag, integer, read, refuse_unknown
 
 T = TypeVar("T")
 

@@ -7,7 +7,8 @@ derivatives. Read ``minimal.py`` first: the same without options, on one page.
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from operator import attrgetter
 
@@ -17,19 +18,22 @@ from typing_extensions import override
 
 from drgs.core.arrays import interleave
 from drgs.core.environment import check_variant
-from drgs.core.errors import PluginError, UnsupportedError
+from drgs.core.errors import UnsupportedError
 from drgs.core.types import Bool
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.integrator.checks import surfaces_in
 from drgs.integrator.image_render import ImageRender
-from drgs.integrator.properties import (
-    check_object,
-    nested_integrators,
-    parse_budget,
-    read_state,
-)
-from drgs.integrator.state import BackwardResult
+from drgs.integrator.properties import check_object, nested_integrators, read_state
+from drgs.integrator.state import BackwardResult, surfaces_in
 from drgs.splatting.rendering import ProjectionStage
+
+
+def _setting(name: str, doc: str) -> property:
+    """Return a property that may be set, for one of the state, which checks it."""
+
+    def assign(self: SplatsIntegrator, value: object) -> None:
+        setattr(self.state, name, value)
+
+    return property(attrgetter(f"state.{name}"), assign, doc=doc)
 
 
 class SplatsIntegrator(mi.CppADIntegrator):
@@ -99,7 +103,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
      * - probes
        - |string|
        - Ids of shapes and emitters that have a probe, separated by commas. (Default: none)
-     * - unseen
+     * - probe_fallback
        - |string|
        - Rays that pass behind something that is visible from a probe's centre. ``none``: they meet
          no splats; ``rays``: they are traced as with ``light`` ``rays``. (Default: ``none``)
@@ -107,7 +111,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - |int|
        - Number of splats that a traced ray draws: 3 (also for 1 and 2) to 4096; 0: it composites
          all. (Default: 4)
-     * - exposure
+     * - radiance_scale
        - |float|
        - Radiance of a splat of colour 1 in reflections and transmission. (Default: 1)
      * - shadows
@@ -170,17 +174,19 @@ class SplatsIntegrator(mi.CppADIntegrator):
     @override
     def traverse(self, cb: mi.TraversalCallback) -> None:
         state, own = self.state, self.state.own
-        found = {name: getattr(own.gaussians, name) for name in PARAMETER_NAMES}
-        found = {name: value for name, value in found.items() if dr.width(value) > 0}
-        found |= own.gaussians.features or {}
+        exposed = {
+            name: value
+            for name, value in own.gaussians.arrays.items()
+            if name != "smoothing" and (name not in PARAMETER_NAMES or dr.width(value) > 0)
+        }
         if own.has_gaussians:
-            found["to_world"] = own.to_world
-        found |= self.objects
+            exposed["to_world"] = own.to_world
+        exposed |= self.objects
         if not self._is_object:
-            found["background"] = state.background
+            exposed["background"] = state.background
             if state.nested is not None:
-                found["nested"] = state.nested
-        for name, value in found.items():
+                exposed["nested"] = state.nested
+        for name, value in exposed.items():
             cb.put(name, value, mi.ParamFlags.Differentiable)
 
     @override
@@ -196,45 +202,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
         if self.last is not None:
             self.last = replace(self.last, frames=[])
 
-    @property
-    def sh_degree(self) -> int:
-        """Highest spherical harmonics degree that is evaluated, 0 to 3. May be set."""
-        return self.state.sh_degree
-
-    @sh_degree.setter
-    def sh_degree(self, degree: int) -> None:
-        if isinstance(degree, (bool, float)) or degree not in range(4):
-            raise PluginError(f"splats: sh_degree must be an integer from 0 to 3, got {degree!r}")
-        self.state.given_degree = int(degree)
-
-    @property
-    def nested_spp(self) -> int:
-        """Samples per pixel of the nested integrator; 0: as many as of the splats. May be set."""
-        return self.state.nested_spp
-
-    @nested_spp.setter
-    def nested_spp(self, count: int) -> None:
-        self.state.nested_spp = count
-
-    @property
-    def smoothing(self) -> mi.Float | None:
-        """Smoothing filter of the own Gaussians (N,), scene units; None: off. May be set."""
-        return self.state.own.gaussians.smoothing
-
-    @smoothing.setter
-    def smoothing(self, filter_: mi.Float | None) -> None:
-        own = self.state.own
-        own.gaussians = replace(own.gaussians, smoothing=filter_)
-
-    @property
-    def error(self) -> float | None:
-        """Error budget, 0..1; None: none. May be set: the next rendering chooses for it."""
-        return self.state.error
-
-    @error.setter
-    def error(self, budget: float | str | None) -> None:
-        self.state.error, self.state.budget_report = parse_budget(budget), None
-
+    sh_degree = _setting("sh_degree", "Highest degree of spherical harmonics, 0 to 3.")
+    nested_spp = _setting("nested_spp", "Samples per pixel of the nested integrator; 0: all.")
+    smoothing = _setting("smoothing", "Smoothing filter of the own Gaussians (N,); None: off.")
+    error = _setting("error", "Error budget, 0..1; None: none. The next rendering chooses for it.")
     budget_report = property(attrgetter("state.budget_report"), doc="What ``error`` has chosen.")
     gaussians = property(attrgetter("state.gaussians"), doc="All rendered Gaussians, world space.")
     pipeline = property(attrgetter("state.pipeline"), doc="Stages that the settings select.")
@@ -265,11 +236,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        sensor = _resolve_sensor(scene, sensor)
-        with self._lock, dr.suspend_grad():
-            self.state.cache.sensor = sensor
-            self._gather(scene)
-            image = ImageRender.prepare(self.state, scene, sensor, seed, spp).image()
+        with self._rendering(scene, sensor, seed, spp) as render:
+            image = render.image()
             if evaluate:
                 dr.eval(image)
         return image if develop else mi.TensorXf()
@@ -285,11 +253,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
         spp: int = 0,
     ) -> None:
         """Accumulate derivatives into parameters; leave a ``BackwardResult`` in ``last``."""
-        sensor = _resolve_sensor(scene, sensor)
-        self._check_derivatives(scene, sensor, dr.ADMode.Backward)
-        with self._lock, dr.suspend_grad():
-            self._gather(scene)
-            render = ImageRender.prepare(self.state, scene, sensor, seed, spp)
+        with self._rendering(scene, sensor, seed, spp, dr.ADMode.Backward) as render:
             gradients = render.backward(params, grad_in)
             means2d, frames = gradients.means2d, self.state.cache.kept["frames 0"].value
             self.last = BackwardResult(
@@ -301,7 +265,6 @@ class SplatsIntegrator(mi.CppADIntegrator):
             if gradients.parameters is not None:
                 with dr.resume_grad():
                     self.state.accumulate(scene, gradients.parameters)
-            sensor.film().clear()  # it may hold an attached block
 
     @override
     def render_forward(
@@ -313,17 +276,38 @@ class SplatsIntegrator(mi.CppADIntegrator):
         spp: int = 0,
     ) -> mi.TensorXf:
         """Return the directional derivative of the image along gradients set on parameters."""
-        sensor = _resolve_sensor(scene, sensor)
-        self._check_derivatives(scene, sensor, dr.ADMode.Forward)
-        with self._lock, dr.suspend_grad():
-            self._gather(scene)
+        with self._rendering(scene, sensor, seed, spp, dr.ADMode.Forward) as render:
             with dr.resume_grad():
                 tangents = self.state.tangents(scene)
-            d_image = ImageRender.prepare(self.state, scene, sensor, seed, spp).tangent(
-                params, tangents
+            return render.tangent(params, tangents)
+
+    @contextmanager
+    def _rendering(
+        self,
+        scene: mi.Scene,
+        sensor: int | mi.Sensor,
+        seed: int | mi.UInt32,
+        spp: int,
+        mode: dr.ADMode = dr.ADMode.Primal,
+    ) -> Iterator[ImageRender]:
+        """Yield an image to be rendered or, with another mode, differentiated."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise UnsupportedError(
+                "splats: rendering cannot be recorded by dr.freeze, as it reads counts back from "
+                "the device: call mi.render outside of the frozen function"
             )
-            sensor.film().clear()  # it holds an attached block
-        return d_image
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        if mode != dr.ADMode.Primal and surfaces_in(scene):
+            from drgs.integrator.light.derivatives import check_derivatives
+
+            check_derivatives(self.state, scene, sensor, mode)
+        with self._lock, dr.suspend_grad():
+            if mode == dr.ADMode.Primal:
+                self.state.cache.sensor = sensor
+            self._update(scene)
+            yield ImageRender.prepare(self.state, scene, sensor, seed, spp)
+            if mode != dr.ADMode.Primal:
+                sensor.film().clear()  # it may hold an attached block
 
     @override
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]  called by keyword
@@ -350,7 +334,7 @@ class SplatsIntegrator(mi.CppADIntegrator):
                     "splats: inside 'aov', derivatives with 'aovs' of this integrator are not "
                     "supported: leave them out, or render it alone"
                 )
-            self._gather(scene)
+            self._update(scene)
             channels = rays.channels(self.state, scene, sensor, sampler, active)
             red, green, blue, alpha, *aovs = channels
             return mi.Color3f(red, green, blue), active & (alpha > 0), aovs, None
@@ -359,42 +343,22 @@ class SplatsIntegrator(mi.CppADIntegrator):
         """Return one line per simulated effect with its reason, and the effects that are not."""
         from drgs.integrator.summary import summary_of_scene
 
-        self._gather(scene)
+        self._update(scene)
         return summary_of_scene(self.state, scene, sensors)
 
-    def _gather(self, scene: mi.Scene) -> None:
-        self.state.gather(scene)
-        if self.state.shadows:
-            from drgs.integrator.shadows import shade
+    def _update(self, scene: mi.Scene) -> None:
+        self.state.update_gaussians(scene)
+        if self.state.lighting.shadows:
+            from drgs.integrator.light.shadows import shade
 
             shade(self.state, scene)
         if self.state.error is not None and self.state.budget_report is None:
-            self._meet_error_budget(scene, self.state.error)
+            from drgs.integrator.error_budget import meet_error_budget
 
-    def _meet_error_budget(self, scene: mi.Scene, error: float) -> None:
-        """Choose approximations for the scene's sensors, or for the one that is rendered."""
-        from drgs.integrator.error_budget import meet_error_budget
-
-        alone = self.state.cache.sensor
-        if sensors := scene.sensors() or ([] if alone is None else [alone]):
-            report = meet_error_budget(self.state, sensors, error)
-            mi.Log(mi.LogLevel.Info, report.line())  # pyright: ignore[reportCallIssue]  no type
-
-    def _check_derivatives(self, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode) -> None:
-        if surfaces_in(scene):
-            from drgs.integrator.derivatives import check_derivatives
-
-            check_derivatives(self.state, scene, sensor, mode)
-
-
-def _resolve_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
-    """Return the sensor; UnsupportedError while Dr.Jit records."""
-    if dr.flag(dr.JitFlag.FreezingScope):
-        raise UnsupportedError(
-            "splats: rendering cannot be recorded by dr.freeze, as it reads counts back from the "
-            "device: call mi.render outside of the frozen function"
-        )
-    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            alone = self.state.cache.sensor
+            if sensors := scene.sensors() or ([] if alone is None else [alone]):
+                report = meet_error_budget(self.state, sensors, self.state.error)
+                mi.Log(mi.LogLevel.Info, report.line())  # pyright: ignore[reportCallIssue]  no type
 
 
 mi.register_integrator("splats", lambda props: SplatsIntegrator(props))

@@ -24,7 +24,7 @@ LIGHTS = {
     "rays, all splats": {"light": "rays", "light_samples": 0},
     "rays, 4 splats a ray": {"light": "rays", "light_samples": 4},
     "probe": {"light": "probe", "probes": "object"},
-    "probe, unseen by rays": {"light": "probe", "probes": "object", "unseen": "rays"},
+    "probe, unseen by rays": {"light": "probe", "probes": "object", "probe_fallback": "rays"},
 }
 
 WHITE = {"type": "rgb", "value": 1.0}

@@ -7,6 +7,7 @@ import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -35,6 +36,24 @@ def pytest_configure(config):
         import drjit as dr
 
         dr.set_thread_count(1)
+
+
+def run_program(*command, cwd=REPOSITORY, **options):
+    """Return the standard output of a process that succeeds; options: see subprocess.run."""
+    words = [str(word) for word in command]
+    result = subprocess.run(words, cwd=cwd, capture_output=True, text=True, **options)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+def copy_checkout(folder):
+    """Copy what a package is built from to a new folder."""
+    for name in ("drgs", "plugins"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(REPOSITORY / name, folder / name, ignore=ignored)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(REPOSITORY / name, folder / name)
+    return folder
 
 
 def _shared(*parts):

@@ -134,7 +134,11 @@ rotation, factor_conic = projection.quat_to_rotation, projection.factor_conic
 MUTANTS = {
     "factor 1.01": (GaussianFalloff, "derivatives", lambda *a: [1.01 * d for d in derivatives(*a)]),
     "wrong sign": (GaussianFalloff, "derivatives", lambda *a: [-d for d in derivatives(*a)]),
-    "no background term": (CenterOrder, "adjoint", lambda *a: adjoint(*a[:5], 0 * a[5], *a[6:])),
+    "no background term": (
+        CenterOrder,
+        "adjoint",
+        lambda order, tiles, d, *a: adjoint(order, tiles, [0 * d[0], *d[1:]], *a),
+    ),
     "quaternion xyzw": (projection, "quat_to_rotation", lambda q: rotation(type(q)(q.yzwx))),
     "no low-pass": (
         projection,

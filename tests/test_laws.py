@@ -26,6 +26,7 @@ from support.cases import (
     SPECIAL_CASES,
     by_rays,
 )
+from support.kernels import kernel_hashes
 from support.views import tensors
 
 import drgs
@@ -234,10 +235,7 @@ projection and its adjoint; and what reads the cuts, the time, the ray or the co
 def kernels_of(case) -> set[int]:
     """Hashes of the kernels of an image and its gradients."""
     weights, values = np.ones((5, case.width * case.height)), case.values
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        case.gradients(values, weights, llvm.Float)
-        return {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
+    return kernel_hashes(lambda: case.gradients(values, weights, llvm.Float))
 
 
 WITH_PINHOLE = {case.name.removesuffix(", pinhole"): case for case in CASES}

@@ -61,7 +61,7 @@ def _approximation(name: str, declared: Declared) -> Parameter:
     text = declared.description
     for word in declared.words:
         text = text.replace(f"{word}:", f"``{word}``:")
-    default = declared.default if declared.unrounded is None else declared.unrounded
+    default = declared.default if declared.decimal is None else declared.decimal
     written = {"alpha_cut": "1/255", "extent": "that of ``alpha_cut``"}.get(name, str(default))
     return Parameter((name,), TYPES[declared.kind], text, written.lower())
 

@@ -58,8 +58,8 @@ from drgs.core.constants import WHITENING_SCALE
 from drgs.core.errors import UnsupportedError
 from drgs.core.types import Array2f, Array3f, Bool, Float
 from drgs.splatting.footprint import (
-    Footprint,
     GaussianFalloff,
+    MicroTileFootprint,
     Offsets,
     SamplePositions,
     flat_columns,
@@ -149,7 +149,7 @@ def _seen_along(
 
 
 @dataclass(frozen=True)
-class RayFootprint(Footprint):
+class RayFootprint(MicroTileFootprint):
     """The same, with the inputs of the derivatives of |e|^2 / D, at the 16 pixels."""
 
     along: list[Float]  # A = a / D: depth of the peak, divided by z_mean / |a_c|
@@ -284,7 +284,7 @@ class RayFalloff(GaussianFalloff):
 
     @override
     def moments(
-        self, footprint: Footprint, weights: list[Float], positions: SamplePositions
+        self, footprint: MicroTileFootprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
         """Sum over the 16 pixels w = d loss / d ln(alpha) times each of these.
 
@@ -344,7 +344,7 @@ class RayFalloff(GaussianFalloff):
 
     @override
     def tangent(
-        self, geometry: list[Float], footprint: Footprint, d_geometry: list[Float]
+        self, geometry: list[Float], footprint: MicroTileFootprint, d_geometry: list[Float]
     ) -> list[Float]:
         assert isinstance(footprint, RayFootprint), "made by self.footprint"
         _, _, p, r, s = geometry[:5]

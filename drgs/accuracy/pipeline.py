@@ -6,8 +6,7 @@ from dataclasses import replace
 
 from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
 from drgs.core.errors import UnsupportedError
-from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.footprint import DEFAULT, FootprintModel, GaussianFalloff
+from drgs.splatting.footprint import DEFAULT, Cutoffs, GaussianFalloff, ImageModel
 from drgs.splatting.projection import (
     color_at_mean,
     compensated_opacity,
@@ -28,7 +27,7 @@ def pipeline_of(
     cutoffs = Cutoffs(
         approximations.alpha_max, approximations.alpha_cut, stop, approximations.extent
     )
-    model = DEFAULT if cutoffs == Cutoffs() else FootprintModel(cutoffs=cutoffs)
+    model = DEFAULT if cutoffs == Cutoffs() else ImageModel(cutoffs=cutoffs)
     projection = PROJECTIONS.get(approximations.projection).value
     falloff = FALLOFFS.get(approximations.falloff).value
     if projection.falloff is not None:

@@ -19,13 +19,12 @@ from drgs.cameras.camera import Camera
 from drgs.core.arrays import reinterpret, types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.types import Array3f, Float, UInt32
-from drgs.splatting.footprint import Footprint, GaussianFalloff, flat_columns
-from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid
-from drgs.splatting.lanes import load_pixels
+from drgs.splatting.footprint import GaussianFalloff, MicroTileFootprint, flat_columns
+from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid, load_pixels
 from drgs.splatting.projection import (
+    FilmProjection,
     FilmShape,
     GaussianRows,
-    Projection,
     RayTerms,
     Splats2D,
     film_axes,
@@ -64,7 +63,7 @@ class AffineDepths:
         near, far = (load_pixels(bound, lanes, grid) for bound in self.bounds)
         return replace(self, bound=list(zip(near, far, strict=True)))
 
-    def pixel_depths(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
+    def pixel_depths(self, footprint: MicroTileFootprint, keys: list[Float]) -> list[Float]:
         """Return depths in the unit at the 16 pixels; not positive where there is none."""
         found, unit = self._pixel_depths(footprint, keys), keys[-1]
         if not self.bound:
@@ -74,7 +73,7 @@ class AffineDepths:
             for along, (near, far) in zip(found, self.bound, strict=True)
         ]
 
-    def _pixel_depths(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
+    def _pixel_depths(self, footprint: MicroTileFootprint, keys: list[Float]) -> list[Float]:
         coordinates = zip(flat_columns(footprint.u), flat_columns(footprint.v), strict=True)
         return [
             a / denominator for a, denominator in (self._depth_ratio(keys, *e) for e in coordinates)
@@ -91,7 +90,7 @@ class AffineDepths:
 class WithAffineDepth:
     """A projection with the input of :class:`AffineDepths`: the affine covariance with depth."""
 
-    shape: Projection
+    shape: FilmProjection
 
     def __call__(
         self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
@@ -146,7 +145,7 @@ class RayDepths(AffineDepths):
         return a, denominator
 
     @override
-    def _pixel_depths(self, footprint: Footprint, keys: list[Float]) -> list[Float]:
+    def _pixel_depths(self, footprint: MicroTileFootprint, keys: list[Float]) -> list[Float]:
         del keys
         assert isinstance(footprint, RayFootprint), "made by RayFalloff"
         return footprint.along

@@ -22,7 +22,7 @@ to twice the precision.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -35,13 +35,21 @@ from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import Rows, scatter_rows, types_of
 from drgs.core.types import Bool, Float, UInt32
-from drgs.splatting.footprint import Alpha, Footprint, FootprintModel, flat_columns
-from drgs.splatting.grid import PIXELS, Lanes
-from drgs.splatting.lanes import group_by_work, load_lane_row, load_pixels, make_lanes, pixels_of
-from drgs.splatting.projection import Projection, ProjectionModel, Splats2D, ewa
+from drgs.splatting.footprint import Alpha, ImageModel, MicroTileFootprint, flat_columns
+from drgs.splatting.grid import (
+    PIXELS,
+    Lanes,
+    group_by_work,
+    load_lane_row,
+    load_pixels,
+    make_lanes,
+    pixels_of,
+)
+from drgs.splatting.order import CenterOrder
+from drgs.splatting.projection import FilmProjection, ProjectionModel, Splats2D, ewa
 from drgs.splatting.rasterize import (
     ONE_SAMPLE,
-    Layers,
+    CompositedTiles,
     Records,
     SplatGradients,
     any_unfinished,
@@ -50,7 +58,6 @@ from drgs.splatting.rasterize import (
     splat_gradients,
 )
 from drgs.splatting.reduction import sum_runs
-from drgs.splatting.rendering import CenterOrder
 from drgs.splatting.tiles import TileBins
 
 S = TypeVar("S")
@@ -75,7 +82,7 @@ class PixelOrder(CenterOrder):
     @override
     def create(
         cls, projection: type[ProjectionModel], approximations: Approximations
-    ) -> tuple[Projection, PixelOrder]:
+    ) -> tuple[FilmProjection, PixelOrder]:
         shape, depths = projection.shape_with_depth, AffineDepths()
         if projection.falloff is RayFalloff:
             depths = RayDepths()
@@ -92,30 +99,23 @@ class PixelOrder(CenterOrder):
         return self.depths.keys(splats)
 
     @override
-    def composite(self, bins: TileBins, records: Records) -> _OrderedLayers:
+    def composite(self, bins: TileBins, records: Records) -> _OrderedTiles:
         return _composite(bins, records, self)
 
     @override
     def adjoint(
         self,
-        bins: TileBins,
-        records: Records,
-        layers: Layers,
-        d_features: list[Float],
-        d_transmittance: Float,
+        tiles: CompositedTiles,
+        d_planes: Sequence[Float],
         samples: range = ONE_SAMPLE,
         before: SplatGradients | None = None,
     ) -> SplatGradients:
-        assert isinstance(layers, _OrderedLayers), "made by self.composite"
-        inputs = _WalkInputs.from_lists(bins, records, layers.lists, self, samples)
-        return _adjoint(inputs, layers, d_features, d_transmittance, before)
+        inputs = _WalkInputs.from_tiles(tiles, self, samples)
+        return _adjoint(inputs, tiles, d_planes, before)
 
     @override
-    def tangent(
-        self, bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
-    ) -> Layers:
-        assert isinstance(layers, _OrderedLayers), "made by self.composite"
-        return _tangent(bins, records, layers, tangents, self)
+    def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
+        return _tangent(_WalkInputs.from_tiles(tiles, self), tiles, tangents)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -132,7 +132,7 @@ class _Crossing:
     active: Bool  # there is one
     geometry: list[Float]
     features: list[Float]
-    footprint: Footprint
+    footprint: MicroTileFootprint
     alphas: list[Alpha]
 
 
@@ -145,7 +145,7 @@ class _WalkInputs:
     lists: PixelLists
     order: PixelOrder
     lanes: Lanes
-    model: FootprintModel  # bound to the lanes
+    model: ImageModel  # bound to the lanes
     samples: range  # of the lanes
 
     @staticmethod
@@ -164,6 +164,14 @@ class _WalkInputs:
         order = replace(order, depths=order.depths.bind(lanes, bins.grid))
         model = bins.model.bind(lanes, bins.grid)
         return _WalkInputs(bins, records, lists, order, lanes, model, samples)
+
+    @staticmethod
+    def from_tiles(
+        tiles: CompositedTiles, order: PixelOrder, samples: range | None = None
+    ) -> _WalkInputs:
+        """Return the inputs of another walk over composited tiles."""
+        assert isinstance(tiles, _OrderedTiles), "made by PixelOrder.composite"
+        return _WalkInputs.from_lists(tiles.bins, tiles.records, tiles.lists, order, samples)
 
     @property
     def num_places(self) -> int:
@@ -272,13 +280,13 @@ def _insert(places: list[list[Float]], item: list[Float]) -> tuple[list[list[Flo
 
 
 @dataclass(frozen=True)
-class _OrderedLayers(Layers):
-    """Layers with the lists, which the adjoint and the tangent use again."""
+class _OrderedTiles(CompositedTiles):
+    """Composited tiles with the lists, which the adjoint and the tangent use again."""
 
     lists: PixelLists
 
 
-def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedLayers:
+def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedTiles:
     t = types_of(bins.rows.Float)
     lists = PixelLists.build(bins, records, order.depths)
     inputs = _WalkInputs.from_lists(bins, records, lists, order)
@@ -303,12 +311,13 @@ def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedL
     dr.eval(T, C)
     columns = [dr.abs(v) for v in T] + flat_columns(C)
     last = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
-    return _OrderedLayers(
+    return _OrderedTiles(
+        bins=bins,
+        records=records,
         values=scatter_rows(columns, lanes.micro_tile, size),
         ends=scatter_rows([last] * PIXELS, lanes.micro_tile, size),
         stop=scatter_rows([last], lanes.micro_tile, size),
         count=count,
-        grid=bins.grid,
         lists=lists,
     )
 
@@ -320,13 +329,13 @@ def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedL
 
 def _adjoint(
     inputs: _WalkInputs,
-    layers: _OrderedLayers,
-    d_features: list[Float],
-    d_transmittance: Float,
+    tiles: CompositedTiles,
+    d_planes: Sequence[Float],
     before: SplatGradients | None,
 ) -> SplatGradients:
+    d_transmittance, *d_features = d_planes
     g = [load_pixels(plane, inputs.lanes, inputs.bins.grid) for plane in d_features]
-    totals = _totals(inputs, layers, g, d_transmittance)
+    totals = _totals(inputs, tiles, g, d_transmittance)
     pairs = _pairs(inputs, totals, g)
     return _sum_items(inputs, _sum_pixels(inputs, pairs, g), before)
 
@@ -340,7 +349,7 @@ def _feature_gradient(
 
 
 def _totals(
-    inputs: _WalkInputs, layers: _OrderedLayers, g: list[list[Float]], d_transmittance: Float
+    inputs: _WalkInputs, tiles: CompositedTiles, g: list[list[Float]], d_transmittance: Float
 ) -> list[tuple[Float, Float]]:
     """Walk first to find b in front of all splats of each pixel, in two numbers."""
     t = types_of(inputs.bins.rows.Float)
@@ -361,7 +370,7 @@ def _totals(
     )
     background = zip(
         *totals,
-        load_lane_row(layers.values, inputs.lanes.micro_tile, 1 + layers.count),
+        load_lane_row(tiles.values, inputs.lanes.micro_tile, 1 + tiles.count),
         load_pixels(d_transmittance, inputs.lanes, inputs.bins.grid),
         strict=True,
     )
@@ -467,16 +476,9 @@ def _add_product(high: Float, low: Float, a: Float, b: Float) -> tuple[Float, Fl
 # ----------------------------------------------------------------------------------------------
 
 
-def _tangent(
-    bins: TileBins,
-    records: Records,
-    layers: _OrderedLayers,
-    tangents: SplatGradients,
-    order: PixelOrder,
-) -> Layers:
-    inputs = _WalkInputs.from_lists(bins, records, layers.lists, order)
-    model, size = inputs.model, inputs.size
-    d_records, count = pack_tangents(bins, tangents), layers.count
+def _tangent(inputs: _WalkInputs, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
+    bins, model, size = inputs.bins, inputs.model, inputs.size
+    d_records, count = pack_tangents(bins, tangents), tiles.count
 
     def carry(met: _Crossing, pixel: int) -> list[Float]:
         d_geometry, d_features = d_records.load(met.entry, met.active)
@@ -511,10 +513,4 @@ def _tangent(
     )
     columns = dT + flat_columns(dC)
     dr.eval(columns)
-    return Layers(
-        values=scatter_rows(columns, inputs.lanes.micro_tile, size),
-        ends=layers.ends,
-        stop=layers.stop,
-        count=count,
-        grid=bins.grid,
-    )
+    return tiles.unpack(scatter_rows(columns, inputs.lanes.micro_tile, size))

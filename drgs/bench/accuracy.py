@@ -18,6 +18,7 @@ import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
 
+from drgs.accuracy.error_budget import Search
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.bench.output import add_out, machine, markdown_table, write_rows
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
@@ -31,7 +32,7 @@ from drgs.datasets import load_dataset
 from drgs.datasets.types import View
 from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.error_budget import Renderer, Search
+from drgs.integrator.error_budget import renderer_of
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
@@ -174,7 +175,7 @@ def rungs_of_budgets(subject: Subject, budgets: Sequence[float]) -> list[Rung]:
     """Return what error budgets choose for the subject's views; print each choice, or why not."""
     cameras = [device_camera(camera, llvm.Float) for camera in subject.cameras]
     gaussians, rungs = subject.gaussians.to(llvm.TensorXf), []
-    renderer = Renderer(gaussians, Approximations(), gaussians.sh_degree, subject.background)
+    renderer = renderer_of(gaussians, Approximations(), gaussians.sh_degree, subject.background)
     search = Search(renderer, cameras)
     for budget in budgets:
         try:

@@ -11,8 +11,9 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
-from typing import TypeVar
+from dataclasses import dataclass, field, fields
+from numbers import Real
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -36,16 +37,15 @@ class Limits:
 
     def allow(self, value: float) -> bool:
         """Return whether ``value``, in single precision as in kernels, is allowed; NaN never is."""
-        if self.or_infinite and value == math.inf:
-            return True
-        with np.errstate(over="ignore"):
-            value = float(np.float32(value))
+        if isinstance(value, float) and not (self.or_infinite and value == math.inf):
+            with np.errstate(over="ignore"):
+                value = float(np.float32(value))
         return (
             (self.gt is None or value > self.gt)
             and (self.ge is None or value >= self.ge)
             and (self.lt is None or value < self.lt)
-            and (self.le is None or value <= self.le)
-            and not math.isnan(value)
+            and (self.le is None or value <= self.le or (self.or_infinite and value == math.inf))
+            and value == value  # not NaN
         )
 
     @property
@@ -62,29 +62,29 @@ FALLOFFS = ClassRegistry("falloff", "drgs.falloffs")
 """Subclasses of ``drgs.splatting.footprint.GaussianFalloff``."""
 
 ORDERS = ClassRegistry("order", "drgs.orders")
-"""Subclasses of ``drgs.splatting.rendering.CenterOrder``."""
+"""Subclasses of ``drgs.splatting.order.CenterOrder``."""
 
 
 @dataclass(frozen=True)
 class Declared:
-    """The declaration of one approximation."""
+    """The declaration of a setting with one value: its type, default and allowed values."""
 
-    default: Value
-    description: str
-    given_words: tuple[str, ...] = ()  # of a str: those that it may be
+    default: Value | None  # None: that of an integer depends on the scene
+    description: str = ""
+    choices: tuple[str, ...] = ()  # of a str: those that it may be
     registry: ClassRegistry | None = None  # of a str: whose names it may be
     limits: Limits | None = None  # of a number
-    unrounded: float | None = None  # in configurations, of a default rounded to single precision
+    decimal: float | None = None  # in configurations, of a default rounded to single precision
 
     @property
     def kind(self) -> type:
         """The type of values: bool, int, float or str."""
-        return type(self.default)
+        return int if self.default is None else type(self.default)
 
     @property
     def words(self) -> tuple[str, ...]:
         """The texts that a value may be, including names of installed extensions."""
-        return self.given_words if self.registry is None else tuple(self.registry.names())
+        return self.choices if self.registry is None else tuple(self.registry.names())
 
     @property
     def expected_values(self) -> str:
@@ -102,6 +102,24 @@ class Declared:
             return value in self.registry
         return not self.words or value in self.words
 
+    def convert(self, value: Any) -> Any:
+        """Return a number of this kind, and all else unchanged."""
+        is_number = isinstance(value, Real) and not isinstance(value, bool)
+        return float(value) if self.kind is float and is_number else value
+
+    def check(self, name: str, value: Any) -> Any:
+        """Return a value of this kind.
+
+        Raises TypeError for another type and ValueError outside of the limits, with the name.
+        """
+        value = self.convert(value)
+        if type(value) is not self.kind:
+            raise TypeError(f"{name} must be {self.expected_values}, got {value!r}")
+        if not self.allows(value):
+            hint = did_you_mean(str(value), self.words)
+            raise ValueError(f"{name} must be {self.expected_values}, got {value!r}{hint}")
+        return value
+
 
 Default = TypeVar("Default", bool, int, float, str)
 
@@ -111,11 +129,11 @@ def _declare(
     description: str,
     limits: Limits | None = None,
     *,
-    given_words: tuple[str, ...] = (),
+    choices: tuple[str, ...] = (),
     registry: ClassRegistry | None = None,
-    unrounded: float | None = None,
+    decimal: float | None = None,
 ) -> Default:
-    declared = Declared(default, description, given_words, registry, limits, unrounded)
+    declared = Declared(default, description, choices, registry, limits, decimal)
     return field(default=default, metadata={"declared": declared})
 
 
@@ -123,7 +141,7 @@ def _declare(
 class Approximations:
     """The approximations of an image, by default those of 3DGS; :data:`DECLARED` describes each.
 
-    Raises ValueError for a value outside of its limits.
+    Raises TypeError for a value of another type, and ValueError outside of its limits.
     """
 
     projection: str = _declare(
@@ -151,19 +169,19 @@ class Approximations:
     sh_direction: str = _declare(
         "mean",
         "Direction of colours. mean: towards a Gaussian's mean; pixel: along each pixel's ray.",
-        given_words=("mean", "pixel"),
+        choices=("mean", "pixel"),
     )
     alpha_max: float = _declare(
         ALPHA_MAX,
         "Upper clamp of a splat's alpha.",
         Limits("above 0 and below 1 in float32", gt=0, lt=1),
-        unrounded=0.99,
+        decimal=0.99,
     )
     alpha_cut: float = _declare(
         ALPHA_CUT,
         "Minimum alpha, which bounds the extent of splats; 0: unbounded.",
         Limits("from 0 to below 1", ge=0, lt=1),
-        unrounded=1 / 255,
+        decimal=1 / 255,
     )
     transmittance_stop: float = _declare(
         TRANSMITTANCE_STOP,
@@ -188,16 +206,15 @@ class Approximations:
 
     def __post_init__(self) -> None:
         for name, declared in DECLARED.items():
-            value = getattr(self, name)
-            if not declared.allows(value):
-                raise ValueError(f"{name} must be {declared.expected_values}, got {value!r}")
+            value = declared.check(name, getattr(self, name))
+            value = declared.default if value == declared.decimal else value
+            object.__setattr__(self, name, value)
 
     @staticmethod
     def from_values(values: Mapping[str, Value | None]) -> Approximations:
-        """Return those among ``values``; None and unrounded defaults give the default."""
-        given = {name: value for name, value in values.items() if name in DECLARED}
-        changes = {k: v for k, v in given.items() if v not in (None, DECLARED[k].unrounded)}
-        return replace(Approximations(), **changes)
+        """Return those among ``values``; None gives the default."""
+        given: dict[str, Any] = {k: v for k, v in values.items() if k in DECLARED and v is not None}
+        return Approximations(**given)
 
     @property
     def non_default(self) -> dict[str, Value]:
@@ -226,18 +243,18 @@ def from_ply_header(where: str, values: Mapping[str, Value]) -> dict[str, Value]
         hint = did_you_mean(unknown[0], DECLARED)
         note = f"{where}: specifies {format_names(unknown)}, which is not known here and ignored"
         warnings.warn(UserNote(note + hint), stacklevel=2)
-    found: dict[str, Value] = {}
-    for name in (name for name in DECLARED if name in values):
-        declared, value = DECLARED[name], values[name]
-        if declared.kind is float and type(value) is int:
-            value = float(value)
-        if type(value) is not declared.kind or not declared.allows(value):
+    known: dict[str, Value] = {}
+    for name, declared in DECLARED.items():
+        if name not in values:
+            continue
+        try:
+            known[name] = declared.check(name, values[name])
+        except (TypeError, ValueError):
             raise UserError(
                 f"{where}: the header's {name} must be {declared.expected_values}, got "
-                f"{one_line(value, 60)}; correct the line, or remove it"
-            )
-        found[name] = value
-    return found
+                f"{one_line(declared.convert(values[name]), 60)}; correct the line, or remove it"
+            ) from None
+    return known
 
 
 MIN_ERROR = 2e-5

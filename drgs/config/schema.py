@@ -233,9 +233,9 @@ FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
 def _as_field(name: str, declared: Declared) -> tuple[object, FieldInfo]:
     """Return the type and the field of an approximation; infinity is null, as YAML has none."""
     default, description = FITTED_WITH.get(name, declared.default), declared.description
-    kind = Literal[declared.given_words] if declared.given_words else declared.kind
-    if declared.unrounded is not None:
-        default = declared.unrounded
+    kind = Literal[declared.choices] if declared.choices else declared.kind
+    if declared.decimal is not None:
+        default = declared.decimal
     elif default == math.inf:
         kind, default = float | None, None
         description = f"{description} null: the radius at which alpha falls to alpha_cut."

@@ -72,7 +72,7 @@ MAX_INT = 2**31 - 1  # the counters of Mitsuba and Dr.Jit are of 32 bits
 MAX_COEFFICIENT = 1e6  # A coefficient of distortion, in size: calibrations give less than 1e3
 
 MAX_FEATURES = 64
-"""Channels that an image composites, with RGB or without: see :mod:`drgs.splatting.feature_groups`.
+"""Channels that an image composites, with RGB or without: see :mod:`drgs.splatting.order`.
 The kernels of 64 and their derivatives compile in 8 s with AVX2, once."""
 
 SH_C0 = 0.28209479177387814

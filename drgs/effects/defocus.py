@@ -16,16 +16,21 @@ from typing_extensions import override
 from drgs.cameras.camera import Camera
 from drgs.core.constants import NEGLIGIBLE_ALPHA
 from drgs.core.types import Array2f, Array3f, Bool, Float
-from drgs.splatting.cutoffs import Cutoffs
-from drgs.splatting.footprint import Footprint, GaussianFalloff, Offsets, SamplePositions
-from drgs.splatting.projection import FilmShape, GaussianRows, Projection, Splats2D
+from drgs.splatting.footprint import (
+    Cutoffs,
+    GaussianFalloff,
+    MicroTileFootprint,
+    Offsets,
+    SamplePositions,
+)
+from drgs.splatting.projection import FilmProjection, FilmShape, GaussianRows, Splats2D
 
 
 @dataclass(frozen=True)
 class Defocused:
     """A projection, blurred by the camera's aperture."""
 
-    shape: Projection
+    shape: FilmProjection
 
     def __call__(
         self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
@@ -101,12 +106,12 @@ class DimmedFalloff(GaussianFalloff):
     @override
     def footprint(
         self, geometry: list[Float], offsets_from: Offsets, active: Bool | bool
-    ) -> Footprint:
+    ) -> MicroTileFootprint:
         return self.falloff.footprint(geometry[:-1], offsets_from, active)
 
     @override
     def moments(
-        self, footprint: Footprint, weights: list[Float], positions: SamplePositions
+        self, footprint: MicroTileFootprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
         return self.falloff.moments(footprint, weights, positions)
 
@@ -121,6 +126,6 @@ class DimmedFalloff(GaussianFalloff):
 
     @override
     def tangent(
-        self, geometry: list[Float], footprint: Footprint, d_geometry: list[Float]
+        self, geometry: list[Float], footprint: MicroTileFootprint, d_geometry: list[Float]
     ) -> list[Float]:
         return self.falloff.tangent(geometry[:-1], footprint, d_geometry[:-1])

@@ -25,9 +25,8 @@ from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.core.types import Float
-from drgs.splatting.footprint import FeatureGroup, FootprintModel, SamplePositions, SplatFeatures
-from drgs.splatting.grid import PIXELS, Lanes, TileGrid
-from drgs.splatting.lanes import load_pixels
+from drgs.splatting.footprint import FeatureGroup, ImageModel, SamplePositions, SplatFeatures
+from drgs.splatting.grid import PIXELS, Lanes, TileGrid, load_pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +149,7 @@ class OccludedFeatures(SplatFeatures):
         return [dr.select(depth <= z, value, 0) for z, _ in self.bound[pixel]]
 
 
-def occlude(model: FootprintModel, surfaces: Sequence[Surface], camera: Camera) -> FootprintModel:
+def occlude(model: ImageModel, surfaces: Sequence[Surface], camera: Camera) -> ImageModel:
     """Return an image model of splats that the surfaces may hide; nearest surface first."""
     grid = TileGrid(camera.width, camera.height)
     return replace(model, features=OccludedFeatures(model.features, tuple(surfaces), grid))

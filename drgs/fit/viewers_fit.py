@@ -125,7 +125,7 @@ def tuning(config: FitConfig) -> FitConfig:
 
 
 def _configured_default(name: str) -> object:
-    default, unrounded = DECLARED[name].default, DECLARED[name].unrounded
-    if unrounded is not None:
-        return unrounded
+    default, decimal = DECLARED[name].default, DECLARED[name].decimal
+    if decimal is not None:
+        return decimal
     return None if default == math.inf else default

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 import drjit as dr
 import numpy as np
@@ -192,11 +192,23 @@ class Gaussians(Generic[Tensor]):
         concat = np.concatenate if isinstance(self.sh0, np.ndarray) else dr.concat
         return cast("Callable[..., Tensor]", concat)((self.sh0, self.shN), axis=1)
 
+    @property
+    def arrays(self) -> dict[str, Tensor]:
+        """All arrays by name: the parameters, the smoothing filter if there is one, features."""
+        return {name: getattr(self, name) for name in self._names} | dict(self.features or {})
+
+    @staticmethod
+    def from_arrays(arrays: Mapping[str, Any]) -> Gaussians[Any]:
+        """Return Gaussians of :attr:`arrays`; names of no parameter are those of features."""
+        names = (*PARAMETER_NAMES, "smoothing")
+        features = {name: array for name, array in arrays.items() if name not in names}
+        parameters = {name: array for name, array in arrays.items() if name in names}
+        return Gaussians(**parameters, features=features or None)
+
     def numpy(self) -> Gaussians[np.ndarray]:
         """Return the same Gaussians as numpy arrays on the host."""
-        features = self.features and {k: np.array(v) for k, v in self.features.items()}
-        arrays = {name: np.array(getattr(self, name)) for name in self._names}
-        return cast("Gaussians[np.ndarray]", replace(self, **arrays, features=features))
+        host = Gaussians.from_arrays({name: np.array(v) for name, v in self.arrays.items()})
+        return replace(host, rendered_with=self.rendered_with, origin=self.origin)
 
     def to(self, tensor_type: type[dr.ArrayBase]) -> Gaussians[TensorXf]:
         """Copy to Dr.Jit tensors of type ``tensor_type`` (``TensorXf`` or ``TensorXf64``)."""
@@ -207,9 +219,8 @@ class Gaussians(Generic[Tensor]):
             flat = from_host(flat_type, values)
             return flat if values.ndim == 1 else tensor_type(flat, values.shape)
 
-        features = self.features and {k: upload(v) for k, v in self.features.items()}
-        tensors = {name: upload(getattr(self, name)) for name in self._names}
-        return cast("Gaussians[TensorXf]", replace(self, **tensors, features=features))
+        uploaded = Gaussians.from_arrays({name: upload(v) for name, v in self.arrays.items()})
+        return replace(uploaded, rendered_with=self.rendered_with, origin=self.origin)
 
     def _rotate(self: Gaussians[np.ndarray], rotation: np.ndarray) -> Gaussians[np.ndarray]:
         from drgs.gaussians.rotation import rotate_gaussians, to_float32

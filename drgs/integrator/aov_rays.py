@@ -17,13 +17,12 @@ from drgs.cameras.camera import Camera
 from drgs.core.arrays import interleave
 from drgs.core.errors import UnsupportedError
 from drgs.integrator.film import Channels, SamplePoints, pixel_corners, split_passes, split_samples
-from drgs.integrator.image_render import hybrid_of
-from drgs.integrator.sensor_render import SensorRender, constant_background
+from drgs.integrator.image_render import SensorRender, constant_background, nested_surfaces
 from drgs.integrator.sensors import camera_from_sensor, is_batch, read_sensor
 from drgs.integrator.state import SplatsState
 
 if TYPE_CHECKING:  # imported where a scene has surfaces
-    from drgs.integrator.surfaces import Hybrid
+    from drgs.integrator.light.surfaces import NestedSurfaces
 
 NESTED_VIEW = -1  # index of the view in the cache
 PIXEL_MARGIN_PX = 1 / 16  # largest distance of a ray from its pixel; float32 finds it to 1e-3 px
@@ -74,9 +73,9 @@ class ImageRays:
         active: mi.Bool,
     ) -> Channels:
         """Return colour, alpha and AOVs of the rays, each Float (H * W * count,)."""
-        hybrid = hybrid_of(splats, scene, sensor, 0, 1)
+        nested = nested_surfaces(splats, scene, sensor, 0, 1)
         # A single sample would average the coverage of edges over their pixels.
-        times = 2 if self.count == 1 and hybrid is not None else 1
+        times = 2 if self.count == 1 and nested is not None else 1
         view = SensorRender(
             splats=splats,
             scene=scene,
@@ -85,29 +84,29 @@ class ImageRays:
             positions=times * self.positions,
             key=self,
             has_alpha=True,
-            hybrid=hybrid,
+            nested=nested,
         )
-        if hybrid is not None:
-            hybrid = hybrid.with_surfaces(view.num_surfaces(hybrid))
-            view = replace(view, hybrid=hybrid)
+        if nested is not None:
+            nested = nested.with_surfaces(view.num_surfaces(nested))
+            view = replace(view, nested=nested)
         passes = view.channels(view.planes(), constant_background(splats))
         samples = split_samples(self.positions, passes[: len(self.positions)])
         channels = [mi.Float(interleave(list(planes))) for planes in zip(*samples, strict=True)]
         for kind in ("frames", "surfaces"):
             splats.cache.forget(f"{kind} {NESTED_VIEW}")
-        if hybrid is not None:
-            channels = self._with_surfaces(channels, hybrid, sampler, active)
+        if nested is not None:
+            channels = self._with_surfaces(channels, nested, sampler, active)
         return channels
 
     def _with_surfaces(
-        self, channels: Channels, hybrid: Hybrid, sampler: mi.Sampler, active: mi.Bool
+        self, channels: Channels, nested: NestedSurfaces, sampler: mi.Sampler, active: mi.Bool
     ) -> Channels:
         """Add the nested integrator's radiance along the rays."""
-        insertion = hybrid.insertion
-        aovs, own = channels[3 : -len(insertion.channels)], channels[-len(insertion.channels) :]
-        behind = own[2 * insertion.num_surfaces :] or [mi.Float(0)] * 3
-        images = [*map(list, hybrid.radiances(self.ray, sampler, active)), behind]
-        shown = insertion.visible_radiance(own, images)
+        compositor = nested.compositor
+        aovs, own = channels[3 : -len(compositor.channels)], channels[-len(compositor.channels) :]
+        behind = own[2 * compositor.num_surfaces :] or [mi.Float(0)] * 3
+        images = [*map(list, nested.radiances(self.ray, sampler, active)), behind]
+        shown = compositor.visible_radiance(own, images)
         return [*(s + c for s, c in zip(shown, channels[:3], strict=True)), *aovs]
 
 

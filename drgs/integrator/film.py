@@ -21,9 +21,8 @@ from typing_extensions import override
 from drgs.core.arrays import divide, from_host, interleave, quotient, repeat_array, types_of
 from drgs.core.errors import UnsupportedError
 from drgs.core.types import Float
-from drgs.splatting.footprint import PixelCenters, SamplePositions, flat_columns, total
-from drgs.splatting.grid import MICRO, Lanes, TileGrid
-from drgs.splatting.lanes import load_pixels
+from drgs.splatting.footprint import PixelCenters, SamplePositions
+from drgs.splatting.grid import MICRO, Lanes, TileGrid, load_pixels
 
 Channels = list[Float]  # by pass, each (samples * H * W,): red, green, blue, perhaps alpha, AOVs
 
@@ -55,6 +54,11 @@ def num_samples(film: mi.Film, x: Float | float) -> int:
 def sample_offsets(positions: SamplePositions) -> tuple[Float | float, Float | float]:
     """Return x and y of sample positions from their pixels' upper left corners, px."""
     return (positions.x, positions.y) if isinstance(positions, SamplePoints) else (0.5, 0.5)
+
+
+def decode(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
+    """Return linear radiance A D(C / A); color: C, display space; coverage: A, sum of weights."""
+    return coverage * mi.math.srgb_to_linear(color / dr.select(coverage > 0, coverage, 1))
 
 
 class CenterSamples:
@@ -276,26 +280,6 @@ class LanePoints(SamplePositions):
         dx = [first_x + (pixel % MICRO) + in_x for pixel, in_x in enumerate(self.x)]
         dy = [first_y + (pixel // MICRO) + in_y for pixel, in_y in enumerate(self.y)]
         return _grid(dx), _grid(dy)
-
-    @override
-    def sum(self, values: list[Float]) -> Float:
-        return total(values)
-
-    @override
-    def sum_dx(self, values: list[Float], dx: list) -> Float:
-        return total(_products(values, dx))
-
-    @override
-    def sum_dy(self, values: list[Float], dy: list) -> Float:
-        return total(_products(values, dy))
-
-    @override
-    def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
-        return total(_products(_products(values, dy), dy))
-
-
-def _products(values: list[Float], grid: list[list[Float]]) -> list[Float]:
-    return [a * b for a, b in zip(values, flat_columns(grid), strict=True)]
 
 
 def _grid(values: list[Float]) -> list[list[Float]]:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,82 +20,73 @@ import numpy as np
 from drgs.config.approximations import (
     DECLARED,
     Approximations,
+    Declared,
+    Limits,
     Value,
     from_ply_header,
-    parse_error,
 )
 from drgs.core.constants import MAX_INT, NEAR
 from drgs.core.errors import PluginError, PluginTypeError, UserNote, did_you_mean
 from drgs.core.origin import WORLD, format_origin
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.checks import check_shapes
-from drgs.integrator.rays import TransportIntegrator
-from drgs.integrator.state import AOVS, SplatObject, SplatsState, feature_widths
+from drgs.integrator.light.rays import TransportIntegrator
+from drgs.integrator.state import (
+    AOVS,
+    LightSettings,
+    SplatObject,
+    SplatsState,
+    check_shapes,
+    feature_widths,
+    parse_budget,
+)
 
 if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
-    from drgs.integrator.gathering import ShRotation
+    from drgs.integrator.parts import ShRotation
 
 
-class Property(NamedTuple):
-    """A property of a plugin, with values of one type."""
-
-    kind: type  # bool, int, float or str
-    default: Value | None
-    expected: str  # in messages
-    allows: Callable[[Any], bool] = lambda value: True
-    words: Sequence[str] = ()
-
-
-def flag(default: bool) -> Property:
+def flag(default: bool) -> Declared:
     """Declare true or false."""
-    return Property(bool, default, "true or false")
+    return Declared(default)
 
 
-def number(default: float) -> Property:
+def number(default: float) -> Declared:
     """Declare a number that is finite in single precision."""
-    return Property(float, default, "a finite number", lambda v: math.isfinite(_single(v)))
+    return Declared(float(default), limits=Limits("a finite number", gt=-math.inf, lt=math.inf))
 
 
-def positive(default: float) -> Property:
+def positive(default: float) -> Declared:
     """Declare a number that is positive and finite in single precision."""
-    return Property(float, default, "a positive number", lambda v: 0 < _single(v) < math.inf)
+    return Declared(float(default), limits=Limits("a positive number", gt=0, lt=math.inf))
 
 
-def integer(default: int | None, least: int, most: int = MAX_INT) -> Property:
+def integer(default: int | None, least: int, most: int = MAX_INT) -> Declared:
     """Declare an integer from ``least`` to ``most``."""
-    expected = f"an integer from {least} to {most}"
-    return Property(int, default, expected, lambda v: least <= v <= most)
+    return Declared(default, limits=Limits(f"an integer from {least} to {most}", ge=least, le=most))
 
 
-def one_of(*words: str) -> Property:
+def one_of(*words: str) -> Declared:
     """Declare one of several words, the first of which is the default."""
-    return Property(str, words[0], f"one of {', '.join(words)}", words.__contains__, words)
+    return Declared(words[0], choices=words)
 
 
-def _single(value: float) -> float:
-    with np.errstate(over="ignore"):
-        return float(np.float32(value))
+@contextmanager
+def _naming(props: mi.Properties) -> Iterator[None]:
+    """Raise errors of values as those of the plugin."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        kind = PluginTypeError if isinstance(error, TypeError) else PluginError
+        raise kind(f"{props.plugin_name()}: {error}") from None
 
 
-def read(props: mi.Properties, declared: Mapping[str, Property]) -> dict[str, Any]:
+def read(props: mi.Properties, declared: Mapping[str, Declared]) -> dict[str, Any]:
     """Return the values of declared properties, or their defaults."""
-    return {
-        name: _check_property(props, name, one) if name in props else one.default
-        for name, one in declared.items()
-    }
-
-
-def _check_property(props: mi.Properties, name: str, declared: Property) -> Any:
-    value, where = props[name], f"{props.plugin_name()}: {name} must be"
-    if declared.kind is float and type(value) is int:
-        value = float(value)
-    if type(value) is not declared.kind:
-        raise PluginTypeError(f"{where} {declared.expected}, got {value!r}")
-    if not declared.allows(value):
-        hint = did_you_mean(str(value), declared.words)
-        raise PluginError(f"{where} {declared.expected}, got {value!r}{hint}")
-    return value
+    with _naming(props):
+        return {
+            name: one.check(name, props[name]) if name in props else one.default
+            for name, one in declared.items()
+        }
 
 
 def matrix(props: mi.Properties, name: str) -> np.ndarray:
@@ -120,17 +112,19 @@ SETTINGS = {
     "srgb_primitives": flag(True),
     "sh_degree": integer(None, 0, 3),
     "nested_spp": integer(0, least=0),
-    "light": one_of("none", "probe", "rays"),
-    "light_samples": integer(4, 0, 4096),
-    "unseen": one_of("none", "rays"),
-    "exposure": positive(1.0),
 }
 """Settings of ``splats`` with single values, besides the approximations."""
 
-APPROXIMATIONS = {
-    name: Property(one.kind, one.default, one.expected_values, one.allows, one.words)
-    for name, one in DECLARED.items()
+LIGHT_SETTINGS = {
+    "light": one_of("none", "probe", "rays"),
+    "light_samples": integer(4, 0, 4096),
+    "probe_fallback": one_of("none", "rays"),
+    "radiance_scale": positive(1.0),
 }
+"""Those of light between splats and surfaces."""
+
+FORMER_NAMES = {"unseen": "probe_fallback", "exposure": "radiance_scale"}
+"""Names that properties of ``splats`` had, which are still read."""
 
 FEATURE = "feature_"  # prefix of the names of the user's own features
 SHAPES_TO_WORLD = "shapes_to_world"  # prefix of properties with the ``to_world`` of shapes
@@ -150,7 +144,7 @@ KNOWN = (
         "ignore",
         "error",
     ),
-    *("smoothing", *SETTINGS, *APPROXIMATIONS, *PARAMETER_NAMES),
+    *("smoothing", *SETTINGS, *LIGHT_SETTINGS, *DECLARED, *PARAMETER_NAMES),
 )
 """Properties of ``splats``, besides nested objects and names with a prefix."""
 
@@ -163,6 +157,9 @@ def read_state(
     nested: Sequence[mi.SamplingIntegrator],
 ) -> SplatsState:
     """Return the state of ``splats``; objects: nested ``splats``; nested: other integrators."""
+    for former, name in FORMER_NAMES.items():
+        if former in props and name not in props:
+            props[name] = props[former]
     if len(nested) > 1:
         raise PluginError(
             f"splats: at most one integrator can be nested besides splats, got {len(nested)}"
@@ -177,23 +174,28 @@ def read_state(
         own.check_to_world()
     every = {"": own} | {f"{name}.": one for name, one in objects.items()}
     header = _merge_headers(props, {one.file: one.header for one in every.values() if one.file})
-    given = {name: one for name, one in APPROXIMATIONS.items() if name in props}
+    with _naming(props):
+        given = {name: props[name] for name in DECLARED if name in props}
+        approximations = Approximations(**{**header, **given})
     settings = read(props, SETTINGS)
     state = SplatsState(
         own=own,
         nested_objects=dict(objects),
-        turns=_turns_of_shapes(props),
+        sh_rotations=_sh_rotations(props),
         background=_background(props),
         nested=next(iter(nested), None),
         default_degree=max(one.gaussians.sh_degree for one in every.values()),
         given_degree=settings.pop("sh_degree"),
-        given_approximations=Approximations(**{**header, **read(props, given)}),
+        given_approximations=approximations,
         header=header,
         aovs=_aovs(props, [*AOVS, *feature_widths(every)]),
-        error=parse_budget(props.get("error")),
+        given_error=parse_budget(props.get("error")),
         ignore=_words(props, "ignore"),
-        probes=_words(props, "probes"),
-        shadows=_words(props, "shadows"),
+        lighting=LightSettings(
+            **read(props, LIGHT_SETTINGS),
+            probes=_words(props, "probes"),
+            shadows=_words(props, "shadows"),
+        ),
         **settings,
     )
     _check_settings(state)
@@ -203,13 +205,13 @@ def read_state(
 
 
 def _check_settings(state: SplatsState) -> None:
-    light, nested = state.light, state.nested
+    light, nested = state.lighting.light, state.nested
     if light != "none" and nested is not None and not isinstance(nested, TransportIntegrator):
         raise PluginError(
             f"splats: with light '{light}', the nested integrator must be splatpath, got "
             f"{nested.class_name()}; it takes max_depth, rr_depth and hide_emitters as path does"
         )
-    if light == "probe" and not state.probes:
+    if light == "probe" and not state.lighting.probes:
         raise PluginError(
             "splats: with light 'probe', probes must be ids of shapes and emitters, got none"
         )
@@ -218,16 +220,6 @@ def _check_settings(state: SplatsState) -> None:
             raise PluginError(
                 f"splats: ignore must be a list of {', '.join(IGNORABLE)}, got {word!r}"
             )
-
-
-def parse_budget(value: object) -> float | None:
-    """Return an error budget given as a number, or as text with a unit; None: none."""
-    if value is None:
-        return None
-    try:
-        return parse_error(value)
-    except ValueError as error:
-        raise PluginError(f"splats: error {error}") from None
 
 
 def _words(props: mi.Properties, name: str) -> tuple[str, ...]:
@@ -296,21 +288,21 @@ def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:
     return mi.TensorXf(value)
 
 
-def _turns_of_shapes(props: mi.Properties) -> dict[str, ShRotation]:
+def _sh_rotations(props: mi.Properties) -> dict[str, ShRotation]:
     """Return rotations of spherical harmonics by ids of shapes; "": all other shapes."""
     names = [name for name in props.keys() if name.startswith(SHAPES_TO_WORLD)]  # noqa: SIM118
     if not names:
         return {}
     from drgs.gaussians.similarity import Similarity
-    from drgs.integrator.gathering import ShRotation
+    from drgs.integrator.parts import ShRotation
 
-    turns = {}
+    sh_rotations = {}
     for name in names:
         shape = name.removeprefix(SHAPES_TO_WORLD).removeprefix("_")
-        turns[shape] = ShRotation.from_rotation(
+        sh_rotations[shape] = ShRotation.from_rotation(
             Similarity.from_matrix(matrix(props, name), f"splats: {name}").rotation
         )
-    return turns
+    return sh_rotations
 
 
 def _background(props: mi.Properties) -> mi.Color3f | mi.Texture:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -15,7 +16,7 @@ from drgs.cameras.viewpoints import Viewpoint
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 from drgs.core.memory import too_large_reason
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import Gaussians
 
 NEAR_CLIP = 1e-9  # scene units: the smallest near plane, so that the integrator's applies
 SQUARE_PIXEL_TOLERANCE = 0.01  # px: largest shift at the border from treating pixels as square
@@ -28,10 +29,7 @@ def make_scene(
     **settings: object,
 ) -> mi.Scene:
     """Return a scene of the integrator ``splats`` with ``settings``, in display space."""
-    uploaded = gaussians.to(mi.TensorXf)
-    tensors = {name: getattr(uploaded, name) for name in PARAMETER_NAMES}
-    if uploaded.smoothing is not None:
-        tensors["smoothing"] = uploaded.smoothing
+    tensors = replace(gaussians, features=None).to(mi.TensorXf).arrays
     bitmap = {"type": "bitmap", "filename": str(background), "wrap_mode": "clamp"}
     integrator = {
         "type": "splats",

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
 from typing_extensions import override
 
-from drgs.cameras.camera import Aperture, Camera
+from drgs.cameras.camera import Aperture, Camera, cameras_in_time
 from drgs.core.arrays import types_of
 from drgs.core.errors import PluginError, PluginTypeError
 from drgs.core.types import Array3f, Float, Matrix3f, Matrix4f
+from drgs.effects.compose import without_effects
 from drgs.integrator.film import Channels, SamplePoints
 from drgs.splatting.footprint import SamplePositions
 
@@ -128,6 +130,28 @@ def camera_from_sensor(state: SensorState) -> Camera:
     camera = state.make(state)
     dr.make_opaque(camera)
     return camera
+
+
+def accumulate_in_sensor(cameras: Sequence[Camera], gradients: list[list[Float]]) -> None:
+    """Accumulate derivatives by ``Camera.numbers()``, by time, into the sensor of the cameras.
+
+    cameras: from :func:`attached_cameras`.
+    """
+    numbers = chain(*(camera.numbers() for camera in cameras))
+    pairs = zip(numbers, chain(*gradients), strict=True)
+    attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]
+    for value, gradient in attached:
+        dr.accum_grad(value, gradient)
+    dr.enqueue(dr.ADMode.Backward, [value for value, _ in attached])
+    dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
+
+
+def attached_cameras(
+    state: SensorState, ignored: Collection[str], samples: int | None = None
+) -> list[Camera]:
+    """Return the cameras of a sensor with its derivatives; samples: of an open shutter."""
+    dr.make_opaque(state.device)  # or each value of a literal would be a new kernel
+    return cameras_in_time(without_effects(state.make(state), ignored), samples)
 
 
 def _perspective(state: SensorState) -> Camera:

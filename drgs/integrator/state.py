@@ -15,20 +15,19 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.accuracy.pipeline import pipeline_of
-from drgs.config.approximations import Approximations, Value
+from drgs.config.approximations import Approximations, Value, parse_error
 from drgs.core.arrays import tangent_of
 from drgs.core.constants import MAX_FEATURES
-from drgs.core.errors import PluginError
+from drgs.core.errors import PluginError, UnsupportedError
 from drgs.core.private import same_variables
 from drgs.core.types import Bool, Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.integrator.checks import check_degree, check_instances, check_shapes, ellipsoids_in
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:
-    from drgs.integrator.gathering import GatheredGaussians, Part, Placement, ShRotation
+    from drgs.integrator.parts import CombinedParts, Part, Placement, ShRotation
 else:
-    GatheredGaussians = ShRotation = Any
+    CombinedParts = ShRotation = Any
 
 T = TypeVar("T")
 
@@ -52,7 +51,7 @@ class BackwardResult:
         times. Call it before a parameter changes.
         """
         sums = [rendering.weighted_sums(frame, plane)[0] for frame in self.frames]
-        return sum(sums[1:], sums[0]) / sum(frame.bins.grid.samples for frame in self.frames)
+        return sum(sums[1:], sums[0]) / sum(frame.tiles.bins.grid.samples for frame in self.frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +69,11 @@ class RenderCache:
 
     kept: dict[str, Cached[Any]] = field(default_factory=dict)  # by name
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
-    gathered: GatheredGaussians | None = None  # None: the own Gaussians alone, unmoved
+    parts: CombinedParts | None = None  # None: the own Gaussians alone, unmoved
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
     instances: list[mi.Shape] = field(default_factory=list)  # of the last scene, checked
     sensor: mi.Sensor | None = None  # rendered last
-    surfaces: Any = None  # drgs.integrator.surfaces.Surfaces of the last scene that has some
+    surfaces: Any = None  # drgs.integrator.light.surfaces.Surfaces of the last scene that has some
     too_close: frozenset[str] = frozenset()  # ids of objects with a logged warning
     shaded: Gaussians | None = None  # in the shadow of surfaces; None: no shadows
 
@@ -109,9 +108,21 @@ class SplatObject:
 
     def check_to_world(self) -> None:
         """Update ``is_moved``; PluginError for a ``to_world`` that is no similarity."""
-        from drgs.integrator.gathering import similarity_of
+        from drgs.integrator.parts import similarity_of
 
         self.is_moved = not similarity_of(self.to_world.matrix, "splats: to_world").is_identity
+
+
+@dataclass(frozen=True)
+class LightSettings:
+    """Light between splats and surfaces, as ``docs/plugins/splats.md`` describes it."""
+
+    light: str
+    light_samples: int
+    probes: Sequence[str]
+    probe_fallback: str
+    shadows: Sequence[str]
+    radiance_scale: float
 
 
 @dataclass
@@ -120,7 +131,7 @@ class SplatsState:
 
     own: SplatObject
     nested_objects: dict[str, SplatObject]  # by name
-    turns: dict[str, ShRotation]  # of harmonics, by shapes' ids; "": of all other shapes
+    sh_rotations: dict[str, ShRotation]  # of harmonics, by shapes' ids; "": of all other shapes
     background: mi.Color3f | mi.Texture  # in display space; or linear
     nested: mi.SamplingIntegrator | None  # of surfaces
     default_degree: int  # of spherical harmonics, where the scene has no other Gaussians
@@ -133,16 +144,11 @@ class SplatsState:
     hide_emitters: bool
     srgb_primitives: bool
     nested_spp: int  # 0: as many as of the splats
-    light: str
-    light_samples: int
-    probes: Sequence[str]
-    unseen: str
-    shadows: Sequence[str]
-    exposure: float
-    error: float | None  # budget of the approximations' error; None: as they are given
-    budget_report: Any = None  # drgs.integrator.error_budget.BudgetReport, once it was met
+    lighting: LightSettings
+    given_error: float | None  # budget of the approximations' error; None: as they are given
+    budget_report: Any = None  # drgs.accuracy.error_budget.BudgetReport, once it was met
     cache: RenderCache = field(default_factory=RenderCache)
-    projection: rendering.ProjectionStage = field(default_factory=rendering.Projected)
+    projection: rendering.ProjectionStage = field(default_factory=rendering.DirectProjection)
 
     @property
     def objects(self) -> dict[str, SplatObject]:
@@ -160,20 +166,49 @@ class SplatsState:
         """Highest spherical harmonics degree that is evaluated."""
         if self.given_degree is not None:
             return self.given_degree
-        if self.cache.gathered is not None:
-            return self.cache.gathered.gaussians.sh_degree
+        if self.cache.parts is not None:
+            return self.cache.parts.gaussians.sh_degree
         return self.default_degree
+
+    @sh_degree.setter
+    def sh_degree(self, degree: int) -> None:
+        if isinstance(degree, (bool, float)) or degree not in range(4):
+            raise PluginError(f"splats: sh_degree must be an integer from 0 to 3, got {degree!r}")
+        self.given_degree = int(degree)
+
+    @property
+    def smoothing(self) -> Float | None:
+        """Smoothing filter of the own Gaussians (N,), scene units; None: off."""
+        return self.own.gaussians.smoothing
+
+    @smoothing.setter
+    def smoothing(self, filter_: Float | None) -> None:
+        self.own.gaussians = replace(self.own.gaussians, smoothing=filter_)
+
+    @property
+    def error(self) -> float | None:
+        """Error budget, 0..1; None: none."""
+        return self.given_error
+
+    @error.setter
+    def error(self, budget: float | str | None) -> None:
+        self.given_error, self.budget_report = parse_budget(budget), None
 
     @property
     def pipeline(self) -> rendering.Pipeline:
         """Stages that the settings select."""
-        others = [feature_of(kind) for kind in self.aovs.values() if kind != "alpha"]
-        features = (rendering.color_features, *others)
-        pipeline = pipeline_of(self.approximations, self.sh_degree, features=features)
-        gathered = self.cache.gathered
-        if gathered is not None and gathered.gaussians.smoothing is not None:
-            pipeline = replace(pipeline, of_smoothing=True)  # it scales with an object
-        return replace(pipeline, source=self.projection)
+        parts = self.cache.parts
+        # A smoothing filter is differentiated where it scales with an object.
+        of_smoothing = parts is not None and parts.gaussians.smoothing is not None
+        kinds = tuple(self.aovs.values())
+        settings = self.approximations, self.sh_degree, of_smoothing, kinds, self.projection
+
+        def make() -> rendering.Pipeline:
+            others = [feature_of(kind) for kind in kinds if kind != "alpha"]
+            pipeline = pipeline_of(*settings[:2], (rendering.color_features, *others))
+            return replace(pipeline, of_smoothing=of_smoothing, source=self.projection)
+
+        return self.cache.find("pipeline", settings, (), make).value
 
     @property
     def approximations(self) -> Approximations:
@@ -193,21 +228,23 @@ class SplatsState:
 
     def settings(self) -> dict[str, object]:
         """Return settings by name, without those that are off or at their default."""
-        gathered = self.cache.gathered
-        parts = [one.gaussians for one in self.objects.values()]
-        parts = parts if gathered is None else [gathered.gaussians]
-        lit = {} if self.light == "none" else {"light": self.light, "exposure": self.exposure}
+        parts = self.cache.parts
+        own = [one.gaussians for one in self.objects.values()]
+        rendered = own if parts is None else [parts.gaussians]
+        lighting = self.lighting
+        lit = {"light": lighting.light, "radiance_scale": lighting.radiance_scale}
         others = {
             "objects": ", ".join(self.nested_objects),
             "hide_emitters": self.hide_emitters,
             "aovs": ", ".join(f"{name}:{kind}" for name, kind in self.aovs.items()),
             "nested": self.nested and self.nested.class_name(),
             "nested_spp": self.nested_spp,
-            **lit,
+            **(lit if lighting.light != "none" else {}),
             "ignore": ", ".join(self.ignore),
         }
         return {
-            "gaussians": sum(p.num_gaussians for p in parts) or "those of the scene's shapes",
+            "gaussians": sum(one.num_gaussians for one in rendered)
+            or "those of the scene's shapes",
             "sh_degree": self.sh_degree,
             "background": self.background,
             "near": self.near,
@@ -234,7 +271,7 @@ class SplatsState:
         """Check that own parameters fit together; keys: none for all."""
         if list(keys) != ["background"]:
             self.cache.forget("frames")
-            self.cache.gathered = None
+            self.cache.parts = None
         if not self.own.has_gaussians:
             return
         own = self.own
@@ -251,32 +288,28 @@ class SplatsState:
 
     def rendered_part_of(self, one: SplatObject, with_all_features: bool = False) -> Gaussians:
         """Return an object's Gaussians in its space, without unrendered filter and features."""
-        found, features = one.gaussians, one.gaussians.features or {}
+        gaussians, features = one.gaussians, one.gaussians.features or {}
         if "smoothing" in self.ignore:
-            found = replace(found, smoothing=None)
+            gaussians = replace(gaussians, smoothing=None)
         if not with_all_features:  # load only those that an AOV uses
             features = {k: v for k, v in features.items() if k in self.aovs.values()}
-        return replace(found, features=features or None)
+        return replace(gaussians, features=features or None)
 
     @property
     def gaussians(self) -> Gaussians:
         """Rendered Gaussians, world space; attached where they are the parameters."""
-        shaded = self.cache.shaded
-        return self.unshaded_gaussians if shaded is None else shaded
+        if self.cache.shaded is not None:
+            return self.cache.shaded
+        if self.cache.parts is None and (self.own.is_moved or self.nested_objects):
+            from drgs.integrator.parts import combine
 
-    @property
-    def unshaded_gaussians(self) -> Gaussians:
-        """Rendered Gaussians, without the shadows of surfaces."""
-        if self.cache.gathered is None and (self.own.is_moved or self.nested_objects):
-            from drgs.integrator.gathering import gather
+            self.cache.parts = combine(self._placements(), None)
+        parts = self.cache.parts
+        return self.rendered_part_of(self.own) if parts is None else parts.gaussians
 
-            self.cache.gathered = gather(self._placements(), None)
-        gathered = self.cache.gathered
-        return self.rendered_part_of(self.own) if gathered is None else gathered.gaussians
-
-    def gather(self, scene: mi.Scene) -> None:
+    def update_gaussians(self, scene: mi.Scene) -> None:
         """Find the scene's Gaussians, and convert them if they have changed."""
-        cache = self.cache
+        cache, self.cache.shaded = self.cache, None
         for one in self.objects.values():  # an update that was refused may have left rows
             check_shapes(self.rendered_part_of(one))
         cache.instances = check_instances(scene, cache.instances)
@@ -284,15 +317,17 @@ class SplatsState:
         cache.has_ellipsoids = bool(shapes)
         with dr.resume_grad():
             is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
-            is_alone = not (shapes or set(self.turns) - {""} or self.nested_objects or is_moved)
-            parts = [] if is_alone else self.parts(shapes)
+            is_alone = not (
+                shapes or set(self.sh_rotations) - {""} or self.nested_objects or is_moved
+            )
+            parts = [] if is_alone else self.attached_parts(scene)
         if is_alone:
-            cache.gathered = None
+            cache.parts = None
         else:
-            from drgs.integrator.gathering import gather
+            from drgs.integrator.parts import combine
 
-            cache.gathered = gather(parts, cache.gathered)
-        gaussians = self.unshaded_gaussians
+            cache.parts = combine(parts, cache.parts)
+        gaussians = self.gaussians
         if gaussians.num_gaussians == 0:
             raise PluginError(
                 "splats: there are no Gaussians: give the integrator 'filename' or tensors "
@@ -301,17 +336,18 @@ class SplatsState:
             )
         check_degree(self.sh_degree, gaussians)
 
-    def parts(self, shapes: Sequence[mi.Shape]) -> list[Part]:
+    def attached_parts(self, scene: mi.Scene) -> list[Part]:
         """Return the Gaussians of objects and shapes, attached, in the order of rendering."""
         parts: list[Part] = [*self._placements()]
-        if shapes or self.turns:
-            from drgs.integrator.gathering import conversions_of
+        shapes = ellipsoids_in(scene)
+        if shapes or self.sh_rotations:
+            from drgs.integrator.parts import conversions_of
 
-            parts += conversions_of(shapes, self.turns)
+            parts += conversions_of(shapes, self.sh_rotations)
         return parts
 
     def _placements(self) -> list[Placement]:
-        from drgs.integrator.gathering import Placement
+        from drgs.integrator.parts import Placement
 
         return [
             Placement.from_matrix(
@@ -322,39 +358,113 @@ class SplatsState:
 
     def accumulate(self, scene: mi.Scene, gradients: Gaussians) -> None:
         """Add derivatives with respect to :attr:`gaussians` to those of the parameters."""
-        if self.cache.gathered is not None:
-            self.cache.gathered.accumulate(self.parts(ellipsoids_in(scene)), gradients)
+        if self.cache.parts is not None:
+            self.cache.parts.accumulate(self.attached_parts(scene), gradients)
             return
-        own = self.own.gaussians
-        features = own.features or {}
-        pairs = [(getattr(own, name), getattr(gradients, name)) for name in PARAMETER_NAMES]
-        pairs += [(features[name], d) for name, d in (gradients.features or {}).items()]
-        for parameter, gradient in pairs:
+        parameters = self.own.gaussians.arrays
+        for name, gradient in gradients.arrays.items():
+            parameter = parameters[name]
             if dr.width(parameter) > 0 and dr.grad_enabled(parameter):
                 dr.accum_grad(parameter, gradient)
 
     def tangents(self, scene: mi.Scene) -> Gaussians:
         """Return derivatives of :attr:`gaussians` along those set on the parameters."""
-        if self.cache.gathered is not None:
-            return self.cache.gathered.tangents(self.parts(ellipsoids_in(scene)))
+        if self.cache.parts is not None:
+            return self.cache.parts.tangents(self.attached_parts(scene))
         own = self.rendered_part_of(self.own)
-        return Gaussians(
-            **{name: tangent_of(getattr(own, name)) for name in PARAMETER_NAMES},
-            features=own.features and {k: tangent_of(v) for k, v in own.features.items()},
+        return Gaussians.from_arrays({name: tangent_of(v) for name, v in own.arrays.items()})
+
+
+def parse_budget(value: object) -> float | None:
+    """Return an error budget given as a number, or as text with a unit; None: none."""
+    if value is None:
+        return None
+    try:
+        return parse_error(value)
+    except ValueError as error:
+        raise PluginError(f"splats: error {error}") from None
+
+
+def check_shapes(gaussians: Gaussians) -> None:
+    """Raise PluginError unless all parameters have rows for the same Gaussians."""
+    num = next(iter(gaussians.means.shape), 1)
+    if num == 0:
+        raise PluginError("splats: at least one Gaussian is needed, got none")
+    rows = {
+        "means": [(3,)],
+        "quats": [(4,)],
+        "log_scales": [(3,)],
+        "logit_opacities": [()],
+        "sh0": [(1, 3)],
+        "shN": [((degree + 1) ** 2 - 1, 3) for degree in range(4)],
+    }
+    for name, allowed in rows.items():
+        got = tuple(getattr(gaussians, name).shape)
+        if got not in [(num, *row) for row in allowed]:
+            expected = " or ".join(f"({', '.join(map(str, ('N', *row)))})" for row in allowed)
+            raise PluginError(
+                f"splats: {name} must have the shape {expected}, with N = {num} the rows of "
+                f"means, got {got}"
+            )
+    for name, tensor in (gaussians.features or {}).items():
+        if len(tensor.shape) != 2 or tensor.shape[0] != num or tensor.shape[1] == 0:
+            raise PluginError(
+                f"splats: {name} must have the shape (N, C), with N = {num} the rows of means and "
+                f"C at least 1, got {tuple(tensor.shape)}"
+            )
+    if gaussians.smoothing is not None and dr.width(gaussians.smoothing) != num:
+        raise PluginError(
+            f"splats: smoothing must have the shape (N), with N = {num} the rows of means, got "
+            f"({dr.width(gaussians.smoothing)},)"
         )
+
+
+def check_degree(degree: int, gaussians: Gaussians) -> None:
+    """Raise PluginError for a spherical harmonics degree that the Gaussians do not have."""
+    if degree > gaussians.sh_degree:
+        raise PluginError(
+            f"splats: sh_degree must be an integer from 0 to {gaussians.sh_degree}, the degree of "
+            f"the Gaussians, got {degree}"
+        )
+
+
+def ellipsoids_in(scene: mi.Scene) -> list[mi.Shape]:
+    """Return the shapes of Gaussians, which are rendered as splats."""
+    return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
+
+
+def surfaces_in(scene: mi.Scene) -> list[mi.Shape]:
+    """Return the shapes that are no Gaussians."""
+    return [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
+
+
+def check_instances(scene: mi.Scene, last: Sequence[mi.Shape]) -> list[mi.Shape]:
+    """Raise UnsupportedError for instances of Gaussians; last: those already checked."""
+    instances = [shape for shape in scene.shapes() if shape.class_name() == "Instance"]
+    if not instances or list(map(id, instances)) == list(map(id, last)):
+        return instances
+    repeated, shapes = mi.traverse(scene).hierarchy, scene.shapes()
+    for node, (group, _) in repeated.items():
+        if isinstance(node, mi.Shape) and node.is_ellipsoids() and node not in shapes:
+            raise UnsupportedError(
+                f"splats: shape group '{group.id()}' holds Gaussians (shape '{node.id()}'), whose "
+                "instances are not supported: use a shape of type ellipsoids for each, with a "
+                "to_world, or a nested splats"
+            )
+    return instances
 
 
 def feature_widths(objects: dict[str, SplatObject]) -> dict[str, int]:
     """Return the columns of features by name; PluginError where objects differ."""
-    found: dict[str, int] = {}
+    widths: dict[str, int] = {}
     for prefix, one in objects.items():
         for name, value in (one.gaussians.features or {}).items():
-            if found.setdefault(name, value.shape[1]) != value.shape[1]:
+            if widths.setdefault(name, value.shape[1]) != value.shape[1]:
                 raise PluginError(
-                    f"splats: {prefix}{name} must have the {found[name]} columns of the other "
+                    f"splats: {prefix}{name} must have the {widths[name]} columns of the other "
                     f"objects' {name}, got {value.shape[1]}"
                 )
-    return found
+    return widths
 
 
 def feature_of(kind: str) -> rendering.Feature:

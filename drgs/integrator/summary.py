@@ -15,9 +15,8 @@ from drgs.cameras.lens import Lens, Pinhole
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.effects.base import SimulatedEffect, antialiasing_effect
 from drgs.effects.compose import without_effects
-from drgs.integrator.checks import surfaces_in
 from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
-from drgs.integrator.state import SplatsState
+from drgs.integrator.state import SplatsState, surfaces_in
 
 FILE_HEADER_REASON = "set by the file"  # for effects that the header of the Gaussians' file sets
 
@@ -36,7 +35,7 @@ def format_effects(effects: Sequence[SimulatedEffect]) -> str:
 
 
 def summary_of_scene(splats: SplatsState, scene: mi.Scene, sensors: Sequence[mi.Sensor]) -> str:
-    """Return the summary of the integrator ``splats``, whose Gaussians are gathered."""
+    """Return the summary of the integrator ``splats``, whose Gaussians are up to date."""
     alone = [one for sensor in sensors for one in sensors_of(sensor)]
     cameras = [camera_from_sensor(read_sensor(one, splats.near).detach()) for one in alone]
     count = len(surfaces_in(scene))
@@ -74,7 +73,7 @@ def summary_of_sensors(
     )
     light = SimulatedEffect(
         "light between splats and surfaces",
-        None if splats.light == "none" else "along rays of surfaces",
+        None if splats.lighting.light == "none" else "along rays of surfaces",
         "the integrator's light",
     )
     of_integrator = _summary_of_integrator(splats, environment, of_cameras, splats.header)

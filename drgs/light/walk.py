@@ -29,7 +29,7 @@ from drgs.core.types import Array3f, Bool, Float, Scalar, UInt32
 from drgs.gaussians.quaternions import quat_to_rotation
 from drgs.gaussians.sh import num_coefficients, sh_basis
 from drgs.light.grid import Ellipsoids, SplatGrid, build_grid
-from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.footprint import Cutoffs
 from drgs.splatting.projection import GaussianRows
 from drgs.splatting.rasterize import composite_step
 

@@ -42,7 +42,7 @@ from drgs.results.folder import relocate_data, require_results
 from drgs.results.refined_cameras import refined_dataset
 
 if TYPE_CHECKING:  # imported where there is an error budget
-    from drgs.integrator.error_budget import BudgetReport
+    from drgs.accuracy.error_budget import BudgetReport
 
 Background = tuple[float, float, float] | Path  # display space, or an image file
 

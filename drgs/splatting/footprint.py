@@ -1,13 +1,13 @@
 """The footprint of a splat at the 16 pixels of a micro-tile: the image model of the kernels.
 
-A :class:`FootprintModel` holds four choices that tiles and compositing share, each an object that
+A :class:`ImageModel` holds four choices that tiles and compositing share, each an object that
 the kernels call while Dr.Jit traces them. The classes here are the base classes and the defaults of
 the 3DGS paper; others are in separate modules, imported when they are chosen:
 
 - *falloff*: alpha around a splat (:class:`GaussianFalloff`)
 - *positions*: sample positions in a pixel (:class:`SamplePositions`: :class:`PixelCenters`)
 - *features*: composited values of a splat (:class:`SplatFeatures`)
-- *cutoffs*: extent of splats and end of pixels (:class:`drgs.splatting.cutoffs.Cutoffs`)
+- *cutoffs*: extent of splats and end of pixels (:class:`Cutoffs`)
 """
 
 from __future__ import annotations
@@ -25,15 +25,46 @@ from drgs.cameras.camera import Camera
 from drgs.cameras.lens import shortest
 from drgs.config.approximations import FALLOFFS
 from drgs.core.arrays import is_float64, reinterpret, types_of
-from drgs.core.constants import WHITENING_SCALE
+from drgs.core.constants import (
+    ALPHA_CUT,
+    ALPHA_MAX,
+    NEGLIGIBLE_ALPHA,
+    TRANSMITTANCE_STOP,
+    WHITENING_SCALE,
+)
 from drgs.core.types import Array2f, Bool, Float
-from drgs.splatting.cutoffs import Cutoffs
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
-from drgs.splatting.projection import Splats2D
+from drgs.splatting.projection import Splats2D, dot
 
 # ----------------------------------------------------------------------------------------------
 # Alpha
 # ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Cutoffs:
+    """Limits at which splats and pixels end. Host numbers: each value compiles its own kernels.
+
+    None of these decisions is differentiated; ``drgs.core.constants`` has the sources of defaults.
+    """
+
+    alpha_max: float = ALPHA_MAX  # largest alpha, below 1
+    alpha_cut: float = ALPHA_CUT  # smallest alpha that is composited; 0: none
+    transmittance_stop: float = TRANSMITTANCE_STOP  # a pixel's last transmittance; 0: none
+    extent: float = math.inf  # standard deviations from the mean beyond which a splat ends
+
+    @property
+    def least_alpha(self) -> float:
+        """``alpha_cut``; where that is 0, an alpha too small to change any sum."""
+        return max(self.alpha_cut, NEGLIGIBLE_ALPHA)
+
+    def log2_floor(self, log2_opacity: Float) -> Float | float:
+        """The base-2 logarithm of the smallest alpha of a splat."""
+        least = math.log2(self.least_alpha)
+        if math.isinf(self.extent):
+            return least
+        at_extent = log2_opacity - 0.5 * math.log2(math.e) * self.extent**2
+        return dr.select(at_extent > least, at_extent, least)
 
 
 def exp2_short(x: Float) -> Float:
@@ -87,7 +118,10 @@ class Alpha:
 
 
 class SamplePositions:
-    """Points of the pixels at which splats are evaluated. Grids of 16 values: 4 rows of 4."""
+    """Points of the pixels at which splats are evaluated. Grids of 16 values: 4 rows of 4.
+
+    Sums are those of points anywhere in their pixels.
+    """
 
     margin: ClassVar[float] = 0.0  # px: distance from a pixel's centre to its point, at most
     samples: int = 1  # times that each pixel is evaluated
@@ -107,19 +141,19 @@ class SamplePositions:
 
     def sum(self, values: list[Float]) -> Float:
         """Sum 16 values."""
-        raise NotImplementedError
+        return total(values)
 
     def sum_dx(self, values: list[Float], dx: list) -> Float:
         """Sum values times dx, a grid of :meth:`offsets`."""
-        raise NotImplementedError
+        return total(_products(values, dx))
 
     def sum_dy(self, values: list[Float], dy: list) -> Float:
         """Sum values times dy."""
-        raise NotImplementedError
+        return total(_products(values, dy))
 
     def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
         """Sum values times dy^2."""
-        raise NotImplementedError
+        return total(_products(_products(values, dy), dy))
 
 
 @dataclass(frozen=True)
@@ -147,16 +181,16 @@ class PixelCenters(SamplePositions):
     def sum_dx(self, values: list[Float], dx: list) -> Float:
         """Sum values times dx: a column shares dx, so columns are summed first."""
         columns = [total([values[MICRO * j + i] for j in range(MICRO)]) for i in range(MICRO)]
-        return _dot(columns, dx[0])
+        return dot(columns, dx[0])
 
     @override
     def sum_dy(self, values: list[Float], dy: list) -> Float:
-        return _dot(self._rows(values), _first_of_rows(dy))
+        return dot(self._rows(values), _first_of_rows(dy))
 
     @override
     def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
         dy = _first_of_rows(dy)
-        return _dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
+        return dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
 
     @staticmethod
     def _rows(values: list[Float]) -> list[Float]:
@@ -179,11 +213,8 @@ def flat_columns(rows: list) -> list[Float]:
     return [value for row in rows for value in row]
 
 
-def _dot(a: list[Float], b: list[Float]) -> Float:
-    result = a[0] * b[0]
-    for x, y in zip(a[1:], b[1:], strict=True):
-        result = dr.fma(x, y, result)
-    return result
+def _products(values: list[Float], grid: list[list[Float]]) -> list[Float]:
+    return [a * b for a, b in zip(values, flat_columns(grid), strict=True)]
 
 
 # ----------------------------------------------------------------------------------------------
@@ -192,7 +223,7 @@ def _dot(a: list[Float], b: list[Float]) -> Float:
 
 
 @dataclass(frozen=True)
-class Footprint:
+class MicroTileFootprint:
     """A splat at the 16 pixels of a micro-tile; grids are lists of 4 rows of 4."""
 
     dx: list  # grid: pixel - mean, px
@@ -272,7 +303,7 @@ class GaussianFalloff:
 
     def footprint(
         self, geometry: list[Float], offsets_from: Offsets, active: Bool | bool
-    ) -> Footprint:
+    ) -> MicroTileFootprint:
         """Evaluate the exponent; on a lane that is not active every alpha is below any floor."""
         x, y, p, r, s, log2_opacity = geometry
         log2_opacity = dr.select(active, log2_opacity, -dr.inf)
@@ -285,10 +316,10 @@ class GaussianFalloff:
             dr.fma(-a, a, dr.fma(-b, b, log2_opacity))
             for a, b in zip(flat_columns(u), flat_columns(v), strict=True)
         ]
-        return Footprint(dx=dx, dy=dy, u=u, v=v, log2_alpha=log2_alpha)
+        return MicroTileFootprint(dx=dx, dy=dy, u=u, v=v, log2_alpha=log2_alpha)
 
     def moments(
-        self, footprint: Footprint, weights: list[Float], positions: SamplePositions
+        self, footprint: MicroTileFootprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
         """Sums over the 16 pixels of w = d loss / d ln(alpha) times 1, u, u dx, u dy, dy, dy^2."""
         dx, dy = footprint.dx, footprint.dy
@@ -327,7 +358,7 @@ class GaussianFalloff:
         return [*others, d_opacity * dr.exp2(-self.log2_opacity(geometry))]
 
     def tangent(
-        self, geometry: list[Float], footprint: Footprint, d_geometry: list[Float]
+        self, geometry: list[Float], footprint: MicroTileFootprint, d_geometry: list[Float]
     ) -> list[Float]:
         """Return the tangent of ln(alpha) at the 16 pixels."""
         _, _, p, r, s, _ = geometry
@@ -356,6 +387,11 @@ class FeatureGroup:
     stored: list[int]  # indices of the stored numbers that they need
     planes: list[int]  # indices of their planes; a plane may belong to several groups
     features: SplatFeatures
+
+    @property
+    def places(self) -> list[int]:
+        """Indices of all planes of the group, among those of the image: transmittance first."""
+        return [0, *(1 + plane for plane in self.planes)]
 
 
 @dataclass(frozen=True)
@@ -439,7 +475,7 @@ class SplatFeatures:
 
 
 @dataclass(frozen=True)
-class FootprintModel:
+class ImageModel:
     """The image model of splats; see the module's description."""
 
     falloff: GaussianFalloff = field(default_factory=GaussianFalloff)
@@ -448,7 +484,7 @@ class FootprintModel:
     cutoffs: Cutoffs = field(default_factory=Cutoffs)
     period: Float | None = None  # px: after it, along x, a splat is seen again; None: never
 
-    def for_camera(self, camera: Camera) -> FootprintModel:
+    def for_camera(self, camera: Camera) -> ImageModel:
         """Return this model for one camera."""
         return replace(
             self,
@@ -461,10 +497,10 @@ class FootprintModel:
         """Raise UnsupportedError if pixels depend on the camera but through the splats."""
         self.features.check_differentiable_in_camera()
 
-    def bind(self, lanes: Lanes, grid: TileGrid) -> FootprintModel:
+    def bind(self, lanes: Lanes, grid: TileGrid) -> ImageModel:
         """Return this model for the lanes of one kernel, with inputs loaded before the loop."""
         positions = self.positions.bind(lanes, grid)
-        return FootprintModel(
+        return ImageModel(
             falloff=self.falloff,
             positions=positions,
             features=self.features.bind(lanes, positions),
@@ -472,7 +508,9 @@ class FootprintModel:
             period=self.period,
         )
 
-    def footprint(self, geometry: list[Float], lanes: Lanes, active: Bool | bool) -> Footprint:
+    def footprint(
+        self, geometry: list[Float], lanes: Lanes, active: Bool | bool
+    ) -> MicroTileFootprint:
         """Evaluate a splat at the pixels of each lane."""
         return self.falloff.footprint(geometry, partial(self._offsets, lanes), active)
 
@@ -485,7 +523,7 @@ class FootprintModel:
         dx, dy = self.positions.offsets(lanes, x, y)
         return [[shortest(each, self.period) for each in row] for row in dx], dy
 
-    def alphas(self, geometry: list[Float], footprint: Footprint) -> Iterator[Alpha]:
+    def alphas(self, geometry: list[Float], footprint: MicroTileFootprint) -> Iterator[Alpha]:
         """Yield alpha at the 16 pixels.
 
         One by one, because Dr.Jit computes in the order of tracing: the values of a pixel that is
@@ -496,4 +534,4 @@ class FootprintModel:
             yield Alpha.from_log2(log2_alpha, floor, self.cutoffs.alpha_max)
 
 
-DEFAULT = FootprintModel()
+DEFAULT = ImageModel()

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import TypeVar
 
+import drjit as dr
+
+from drgs.core.arrays import divide, types_of, with_aligned_stack
 from drgs.core.constants import CULL_MARGIN, CULL_MARGIN_PER_PX
-from drgs.core.types import UInt32
+from drgs.core.types import Bool, Float, UInt32
+
+T = TypeVar("T", Float, UInt32)
 
 MICRO = 4
 """Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
@@ -71,3 +78,114 @@ class Lanes:
     sample: UInt32
     x: UInt32  # first pixel column
     y: UInt32  # first pixel row
+
+
+def make_lanes(
+    Float: type, grid: TileGrid, order: UInt32 | None = None, tiles: range | None = None
+) -> Lanes:
+    """Return lanes in an order that spreads the parts of the image over the launch.
+
+    Dr.Jit splits a small launch into few blocks of consecutive lanes. Groups of neighbouring tiles,
+    whose memory is close together, are visited with a stride near the golden section, so that each
+    block gets a share of the image's busy centre.
+
+    order: UInt32, a permutation of the lanes; None: unchanged. tiles: range of the tiles of all
+    samples; None: all.
+    """
+    t = types_of(Float)
+    tiles = grid.tiles_of(range(grid.samples)) if tiles is None else tiles
+    num_groups = len(tiles) // _GROUP  # the tiles beyond them come last
+    stride = _coprime_stride(max(num_groups, 1))
+    lane = dr.arange(t.UInt32, len(tiles) * MICROS) if order is None else order
+    turn, micro = lane // MICROS, lane % MICROS
+    group = t.UInt64(turn // _GROUP) * dr.opaque(t.UInt64, stride)
+    spread = t.UInt32(group % dr.opaque(t.UInt64, max(num_groups, 1))) * _GROUP + turn % _GROUP
+    tile = dr.select(turn < dr.opaque(t.UInt32, num_groups * _GROUP), spread, turn)
+    tile += dr.opaque(t.UInt32, tiles.start)
+    micro_tile = tile * MICROS + micro
+    sample, tile = divide(tile, grid.num_tiles, grid.samples)
+    columns = dr.opaque(t.UInt32, grid.columns)
+    row = tile // columns
+    return Lanes(
+        micro_tile=micro_tile,
+        micro=micro,
+        tile=tile,
+        sample=sample,
+        x=(tile - row * columns) * TILE + (micro % GRID) * MICRO,
+        y=row * TILE + (micro // GRID) * MICRO,
+    )
+
+
+def group_by_work(Float: type, grid: TileGrid, work: UInt32, tiles: range | None = None) -> Lanes:
+    """Return lanes sorted, within each block, by their approximate number of splats.
+
+    work: UInt32, the number of splats of each lane of :func:`make_lanes`.
+    """
+    level = work // 4
+    level = dr.select(level < _LEVELS, level, _LEVELS - 1)
+    return make_lanes(Float, grid, with_aligned_stack(_sort_in_blocks(level)), tiles)
+
+
+def _sort_in_blocks(level: UInt32) -> UInt32:
+    """Return the lanes ordered by level in each block; the order of equal lanes is arbitrary.
+
+    It only decides which lanes share a vector. (Dr.Jit's sorting functions would synchronise host
+    and device.)
+    """
+    UInt32 = type(level)
+    lane = dr.arange(UInt32, dr.width(level))
+    bucket = lane // _BLOCK * _LEVELS + level
+    counts = dr.zeros(UInt32, -(-dr.width(level) // _BLOCK) * _LEVELS)
+    dr.scatter_add(counts, UInt32(1), bucket, mode=dr.ReduceMode.Direct)
+    dr.eval(bucket)
+    place = dr.scatter_inc(dr.prefix_sum(counts), bucket)
+    order = dr.empty(UInt32, dr.width(level))
+    dr.scatter(order, lane, place)
+    dr.eval(order)
+    return order
+
+
+_GROUP = 8
+"""Tiles that stay together in the launch: with more, its parts take longer than others; with fewer,
+memory is further apart."""
+
+_BLOCK = 32 * MICROS
+"""Number of lanes that are sorted together. In larger blocks, the lanes of a tile, which read the
+same records, are too far apart; in smaller ones, lengths differ more."""
+
+_LEVELS = 256
+
+
+def _coprime_stride(count: int) -> int:
+    stride = max(1, round(count * (math.sqrt(5) - 1) / 2))
+    while math.gcd(stride, count) != 1:
+        stride += 1
+    return stride
+
+
+def load_pixels(plane: Float, lanes: Lanes, grid: TileGrid) -> list[Float]:
+    """The 16 values of a row-major plane of all samples in each micro-tile; 0 off the film."""
+    return [
+        dr.gather(type(plane), plane, index, inside) for index, inside in pixels_of(lanes, grid)
+    ]
+
+
+def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[UInt32, Bool]]:
+    """Return row-major index and on-film mask of the 16 pixels of each micro-tile.
+
+    The index is that in a plane of all samples.
+    """
+    UInt32 = type(lanes.x)
+    width, height = dr.opaque(UInt32, grid.width), dr.opaque(UInt32, grid.height)
+    first_row, pixels = lanes.sample * height, []
+    for pixel in range(PIXELS):
+        row, column = divmod(pixel, MICRO)
+        x, y = lanes.x + column, lanes.y + row
+        pixels.append(((first_row + y) * width + x, (x < width) & (y < height)))
+    return pixels
+
+
+def load_lane_row(values: T, micro_tile: UInt32, planes: int) -> list[T]:
+    """The first 16 values of each micro-tile's row of ``planes`` x 16."""
+    first = micro_tile * (planes * PIXELS)
+    return [dr.gather(type(values), values, first + k) for k in range(PIXELS)]

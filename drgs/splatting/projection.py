@@ -4,7 +4,7 @@ The first stage: ``Gaussians`` + ``Camera`` -> ``Splats2D``. One lane is one Gau
 differentiates the arithmetic. The equations are from Zwicker et al. 2002 ("EWA splatting") as used
 in section 4 of the 3DGS paper, in a form without cancellation in single precision.
 
-A :data:`Projection` projects mean and covariance: :func:`ewa`, or one of another module
+A :data:`FilmProjection` projects mean and covariance: :func:`ewa`, or one of another module
 (``drgs.accuracy.unscented``, ``drgs.accuracy.exact``).
 """
 
@@ -20,12 +20,11 @@ import drjit as dr
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import load_columns, types_of
-from drgs.core.constants import LOW_PASS, MIN_LOW_PASS_PX2, NEGLIGIBLE_ALPHA
+from drgs.core.constants import ALPHA_CUT, LOW_PASS, MIN_LOW_PASS_PX2, NEGLIGIBLE_ALPHA
 from drgs.core.types import Array2f, Array3f, Array4f, Bool, Float, TensorXf
 from drgs.gaussians import sh
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import normalize, quat_to_rotation
-from drgs.splatting.cutoffs import Cutoffs
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ class FilmShape:
         return dr.abs(p * s)
 
 
-Projection = Callable[["GaussianRows", Camera, Array3f, Float | float], FilmShape]
+FilmProjection = Callable[["GaussianRows", Camera, Array3f, Float | float], FilmShape]
 """Maps rows, camera, means (Array3f, camera axes) and low-pass (px^2) to projected shapes."""
 
 
@@ -101,13 +100,13 @@ class ProjectionModel:
     """
 
     falloff: ClassVar[type | None] = None  # its own falloff; None: the configured one
-    shape_with_depth: ClassVar[Projection | None] = None  # returns shapes with RayTerms
+    shape_with_depth: ClassVar[FilmProjection | None] = None  # returns shapes with RayTerms
 
     @staticmethod
     def shape(
         rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
     ) -> FilmShape:
-        """Project; see :data:`Projection`."""
+        """Project; see :data:`FilmProjection`."""
         raise NotImplementedError
 
 
@@ -162,10 +161,10 @@ def project(
     camera: Camera,
     sh_degree: int,
     opacity_rule: OpacityRule,
-    shape: Projection | None = None,
+    shape: FilmProjection | None = None,
     color: SplatColor | None = None,
     low_pass: float = LOW_PASS,
-    least_alpha: float = Cutoffs().least_alpha,
+    least_alpha: float = ALPHA_CUT,
 ) -> Splats2D:
     """Project Gaussians onto the image plane of ``camera``.
 

@@ -46,11 +46,11 @@ and writes them into the slot of this (splat, micro-tile) pair: see
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import and_
-from typing import cast
+from typing import Any, cast
 
 import drjit as dr
 
@@ -58,12 +58,12 @@ from drgs.core.arrays import Rows, divide, quotient, reinterpret, scatter_rows, 
 from drgs.core.private import access_all_lanes
 from drgs.core.types import Array2f, Bool, Float, Int32, UInt32
 from drgs.splatting.footprint import Alpha, SplatFeatures
-from drgs.splatting.grid import GRID, MICRO, MICROS, PIXELS, TILE, TileGrid
-from drgs.splatting.lanes import (
-    Cursor,
-    Entries,
-    EntriesBackToFront,
-    count_entries,
+from drgs.splatting.grid import (
+    GRID,
+    MICRO,
+    MICROS,
+    PIXELS,
+    TILE,
     group_by_work,
     load_lane_row,
     load_pixels,
@@ -78,18 +78,19 @@ from drgs.splatting.reduction import (
     sum_entries,
     sum_runs,
 )
-from drgs.splatting.tiles import TileBins
+from drgs.splatting.tiles import Cursor, Entries, EntriesBackToFront, TileBins, count_entries
 
 
 @dataclass(frozen=True)
-class Layers:
-    """The composited image, stored one row per micro-tile of each sample."""
+class CompositedTiles:
+    """The composited image, stored one row per micro-tile of each sample, and its inputs."""
 
+    bins: TileBins
+    records: Any  # of their order: Records, or those of each group
     values: Float  # (tiles * 16 * (1 + C) * 16,): row: transmittance, then each plane
     ends: UInt32  # (tiles * 16 * 16,): sorted entry from which on a pixel composited nothing
     stop: UInt32  # (tiles * 16,): the largest of them in each micro-tile
     count: int  # C, planes
-    grid: TileGrid
 
     def planes(self) -> list[Float]:
         """Return 1 + C planes in row-major pixel order, Float (samples * H * W,), not evaluated.
@@ -97,8 +98,12 @@ class Layers:
         The first is T, the transmittance of the background; then sum_i w_i c_i for each component
         of c.
         """
-        t = types_of(type(self.values))
-        pixel, grid = dr.arange(t.UInt32, self.grid.num_pixels), self.grid
+        return self.unpack(self.values)
+
+    def unpack(self, values: Float) -> list[Float]:
+        """Return planes, from numbers that are stored as ``values`` are."""
+        t = types_of(type(values))
+        pixel, grid = dr.arange(t.UInt32, self.bins.grid.num_pixels), self.bins.grid
         y = quotient(pixel, grid.width)
         x = pixel - y * dr.opaque(t.UInt32, grid.width)
         sample, y = divide(y, grid.height, grid.samples)
@@ -107,7 +112,7 @@ class Layers:
         micro = ((y % TILE) // MICRO) * GRID + (x % TILE) // MICRO
         base = (tile * MICROS + micro) * (PIXELS * (1 + self.count))
         index = base + (y % MICRO) * MICRO + x % MICRO
-        return [dr.gather(t.Float, self.values, index + PIXELS * k) for k in range(1 + self.count)]
+        return [dr.gather(t.Float, values, index + PIXELS * k) for k in range(1 + self.count)]
 
 
 def composite_step(transmittance: Float, alpha: Float, stop: float) -> tuple[Float, Float, Bool]:
@@ -166,10 +171,10 @@ class Records:
 # ----------------------------------------------------------------------------------------------
 
 
-def composite(bins: TileBins, records: Records) -> Layers:
+def composite(bins: TileBins, records: Records) -> CompositedTiles:
     """Composite the features of all splats.
 
-    bins: from ``bin_footprints``; records: ``Records.from_ranks(bins, bins.rows.load)``.
+    bins: from ``bin_splats``; records: ``Records.from_ranks(bins, bins.rows.load)``.
     """
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
@@ -221,15 +226,16 @@ def composite(bins: TileBins, records: Records) -> Layers:
     columns[:PIXELS] = [dr.abs(T) for T in columns[:PIXELS]]
     ends = [ends[pixel] for pixel in range(PIXELS)]
     dr.eval(columns, ends)
-    layers = Layers(
+    stored = CompositedTiles(
+        bins=bins,
+        records=records,
         values=scatter_rows(columns, lanes.micro_tile, size),
         ends=scatter_rows(ends, lanes.micro_tile, size),
         stop=scatter_rows([largest(ends)], lanes.micro_tile, size),
         count=count,
-        grid=bins.grid,
     )
-    dr.eval(layers.values, layers.ends, layers.stop)
-    return layers
+    dr.eval(stored.values, stored.ends, stored.stop)
+    return stored
 
 
 def sign_bits(value: Float) -> Int32:
@@ -256,7 +262,7 @@ def largest(values: list[UInt32]) -> UInt32:
 
 SPARE_ROWS = 64  # behind the slots, for sums of lanes without a splat
 
-ONE_SAMPLE = range(1)  # samples of layers that have one
+ONE_SAMPLE = range(1)  # samples of an image that has one
 
 
 @dataclass(frozen=True)
@@ -285,27 +291,24 @@ class SplatGradients:
 
 
 def composite_adjoint(
-    bins: TileBins,
-    records: Records,
-    layers: Layers,
-    d_features: list[Float],
-    d_transmittance: Float,
+    tiles: CompositedTiles,
+    d_planes: Sequence[Float],
     samples: range = ONE_SAMPLE,
     before: SplatGradients | None = None,
 ) -> SplatGradients:
     """Return derivatives with respect to the splats, given those with respect to the planes.
 
-    layers: the result of :func:`composite` for the same bins and records; d_features: C planes
-    (samples * H * W,); d_transmittance: plane (samples * H * W,); samples: samples of the layers,
-    added one after the other to the derivatives ``before``. Not differentiated: the order, the
-    decisions (cut, clamp, stop).
+    tiles: the result of :func:`composite`; d_planes: 1 + C planes (samples * H * W,), as of
+    :meth:`CompositedTiles.planes`; samples: which of the image's, added one after the other to the
+    derivatives ``before``. Not differentiated: the order, the decisions (cut, clamp, stop).
     """
-    pairs = CompositedPairs.find(bins, layers.stop, samples)
+    bins = tiles.bins
+    pairs = CompositedPairs.find(bins, tiles.stop, samples)
     bands = split_bands(bins, pairs)
     sums = Rows.empty(bins.rows.Float, bins.num_sums, max(pairs.num_rows, 1))
     for band in bands:
         slots = assign_slots(pairs, band)
-        partials = _partials(bins, records, layers, slots, d_features, d_transmittance)
+        partials = _partials(tiles, slots, d_planes)
         sum_entries(bins, pairs, slots, partials, sums)
 
     def totals(rank: UInt32, sample: UInt32) -> list[Float]:
@@ -314,27 +317,21 @@ def composite_adjoint(
     return splat_gradients(bins, totals, len(samples), before)
 
 
-def _partials(
-    bins: TileBins,
-    records: Records,
-    layers: Layers,
-    slots: Slots,
-    d_features: list[Float],
-    d_transmittance: Float,
-) -> Rows:
+def _partials(tiles: CompositedTiles, slots: Slots, d_planes: Sequence[Float]) -> Rows:
     """Return, by slot, moments and features' derivatives summed over 16 pixels; evaluated."""
-    t, tiles = types_of(bins.rows.Float), slots.band.tiles
-    lanes = make_lanes(t.Float, bins.grid, tiles=tiles)
-    stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
+    bins, (d_transmittance, *d_features) = tiles.bins, d_planes
+    t, in_band = types_of(bins.rows.Float), slots.band.tiles
+    lanes = make_lanes(t.Float, bins.grid, tiles=in_band)
+    stop = dr.gather(t.UInt32, tiles.stop, lanes.micro_tile)
     work = slots.number(Entries(bins, lanes, stop))
-    lanes = group_by_work(t.Float, bins.grid, work, tiles)
-    stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
+    lanes = group_by_work(t.Float, bins.grid, work, in_band)
+    stop = dr.gather(t.UInt32, tiles.stop, lanes.micro_tile)
     entries = EntriesBackToFront(bins, lanes, stop)
     model = bins.model.bind(lanes, bins.grid)
 
     g = [load_pixels(plane, lanes, bins.grid) for plane in d_features]
-    ends = [reinterpret(t.Int32, x) for x in load_lane_row(layers.ends, lanes.micro_tile, 1)]
-    transmittance = load_lane_row(layers.values, lanes.micro_tile, 1 + layers.count)
+    ends = [reinterpret(t.Int32, x) for x in load_lane_row(tiles.ends, lanes.micro_tile, 1)]
+    transmittance = load_lane_row(tiles.values, lanes.micro_tile, 1 + tiles.count)
     partials = Rows.empty(t.Float, bins.num_sums, slots.band.num_slots + SPARE_ROWS)
     behind = load_pixels(d_transmittance, lanes, bins.grid)
     last = dr.alloc_local(t.Float, 2 * PIXELS)
@@ -350,7 +347,7 @@ def _partials(
         cursor = entries.advance(cursor)
         # On a lane that is not active, alpha is zero and no pixel changes.
         with access_all_lanes(t.Float):
-            geometry, features = records.load_anywhere(entry, active)
+            geometry, features = tiles.records.load_anywhere(entry, active)
             footprint = model.footprint(geometry, lanes, active)
             # Comparing unsigned numbers takes more instructions.
             composited = [reinterpret(t.Int32, entry) < end for end in ends]
@@ -454,25 +451,23 @@ def splat_gradients(
 # ----------------------------------------------------------------------------------------------
 
 
-def composite_tangent(
-    bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
-) -> Layers:
+def composite_tangent(tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
     """Return directional derivatives of the planes along ``tangents`` of the 2D splats.
 
-    tangents: the direction, in the fields of the gradients. Returns the tangents of the planes of
-    :func:`composite`. Not differentiated: the order, the decisions.
+    tangents: the direction, in the fields of the gradients. Not differentiated: the order, the
+    decisions.
     """
+    bins, count = tiles.bins, tiles.count
     t = types_of(bins.rows.Float)
-    count = layers.count
     lanes = make_lanes(t.Float, bins.grid)
-    entries = Entries(bins, lanes, dr.gather(t.UInt32, layers.stop, lanes.micro_tile))
+    entries = Entries(bins, lanes, dr.gather(t.UInt32, tiles.stop, lanes.micro_tile))
     model = bins.model.bind(lanes, bins.grid)
     stop = model.cutoffs.transmittance_stop
     d_records = pack_tangents(bins, tangents)
 
     def body(cursor: Cursor, T: list, dT: list, dC: list) -> tuple:
         entry, active = entries.current(cursor)
-        geometry, features = records.load(entry, active)
+        geometry, features = tiles.records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)
         d_geometry, d_features = d_records.load(entry, active)
         d_log_alpha = model.falloff.tangent(geometry, footprint, d_geometry)
@@ -504,13 +499,7 @@ def composite_tangent(
     )
     columns = dT + [v for plane in dC for v in plane]
     dr.eval(columns)
-    return Layers(
-        values=scatter_rows(columns, lanes.micro_tile, size),
-        ends=layers.ends,
-        stop=layers.stop,
-        count=count,
-        grid=bins.grid,
-    )
+    return tiles.unpack(scatter_rows(columns, lanes.micro_tile, size))
 
 
 def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:

@@ -22,8 +22,7 @@ from drgs.core.arrays import Rows, divide, interleave, repeat_array, types_of
 from drgs.core.private import access_all_lanes
 from drgs.core.types import Array2u, Bool, Float, UInt32
 from drgs.splatting.grid import MICROS
-from drgs.splatting.lanes import Entries, find_lowest_bit
-from drgs.splatting.tiles import WORD, TileBins, transpose_masks
+from drgs.splatting.tiles import WORD, Entries, TileBins, find_lowest_bit, transpose_masks
 
 BAND_SLOTS = 1 << 20
 """Slots of a band, as far as whole tiles allow: 38 MB, three colours in single precision.
@@ -42,11 +41,11 @@ class CompositedPairs:
     words: UInt32  # (S * M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
     row: UInt32  # (S * M + 1,): unsorted -> row of sums, or of the next entry that is seen
     first_row: UInt32  # (S * (N + 1),): rank -> first of its rows; one more for each sample
-    samples: range  # of the layers
+    samples: range  # of the image
 
     @staticmethod
     def find(bins: TileBins, stop: UInt32, samples: range) -> CompositedPairs:
-        """Find the pairs before each micro-tile's ``stop``; see :class:`.Layers`."""
+        """Find the pairs before each micro-tile's ``stop``; see :class:`.CompositedTiles`."""
         t, count = types_of(bins.rows.Float), len(samples)
         padded, num_entries = dr.width(bins.masks), bins.num_entries
         _, entry = divide(dr.arange(t.UInt32, count * padded), padded, count)
@@ -82,7 +81,7 @@ class CompositedPairs:
 class Band:
     """Consecutive tiles, their sorted entries, and the number of slots of these."""
 
-    tiles: range  # of all samples of the layers
+    tiles: range  # of all samples of the image
     entries: range  # of all samples of the pairs
     num_slots: int
 

@@ -5,9 +5,9 @@ approximations, as functions and objects. Dr.Jit traces only the functions of th
 effect that is not part of it adds no instruction to any kernel. ``drgs.accuracy.pipeline`` makes a
 pipeline from names.
 
-The chain is  Gaussians -> ``project`` -> Splats2D -> ``footprints_of`` -> Footprints
--> ``bin_footprints`` -> TileBins -> ``composite`` -> Layers.  The adjoint runs backwards: the
-hand-written adjoint of compositing gives the derivatives of the 2D splats, and Dr.Jit
+The chain is  Gaussians -> ``project`` -> Splats2D -> ``splat_table`` -> SplatTable
+-> ``bin_splats`` -> TileBins -> ``composite`` -> CompositedTiles.  The adjoint runs backwards:
+the hand-written adjoint of compositing gives the derivatives of the 2D splats, and Dr.Jit
 differentiates projection and SH, which are traced again, one Gaussian per lane, so no gradient is
 scattered.
 """
@@ -15,27 +15,25 @@ scattered.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import Any, Protocol
+from typing import Protocol
 
 import drjit as dr
 from typing_extensions import override
 
 from drgs.cameras.camera import Camera
-from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import first_numbers, repeat_array, store_columns, types_of
 from drgs.core.constants import LOW_PASS
 from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.splatting.feature_groups import group_features
-from drgs.splatting.footprint import DEFAULT, FootprintModel
+from drgs.splatting.footprint import DEFAULT, ImageModel
 from drgs.splatting.grid import TileGrid
+from drgs.splatting.order import CenterOrder, group_features
 from drgs.splatting.projection import (
+    FilmProjection,
     GaussianRows,
     OpacityRule,
-    Projection,
-    ProjectionModel,
     SplatColor,
     Splats2D,
     color_at_mean,
@@ -44,16 +42,8 @@ from drgs.splatting.projection import (
     plain_opacity,
     project,
 )
-from drgs.splatting.rasterize import (
-    ONE_SAMPLE,
-    Layers,
-    Records,
-    SplatGradients,
-    composite,
-    composite_adjoint,
-    composite_tangent,
-)
-from drgs.splatting.tiles import Footprints, TileBins, bin_footprints, footprints_of
+from drgs.splatting.rasterize import CompositedTiles, SplatGradients
+from drgs.splatting.tiles import SplatTable, TileBins, bin_splats, splat_table
 
 Feature = Callable[[Splats2D, GaussianRows, Camera], list[Float]]
 """Composited values of each splat: columns, Float (N,) each, one for each plane."""
@@ -71,90 +61,42 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
     return [splats.depths]
 
 
-@ORDERS.register("center")
-@dataclass(frozen=True)
-class CenterOrder:
-    """The order of compositing, by the depth of the means; the base of all orders."""
-
-    @classmethod
-    def create(
-        cls, projection: type[ProjectionModel], approximations: Approximations
-    ) -> tuple[Projection, CenterOrder]:
-        """Return the projection, extended by the inputs of the order, and the order."""
-        del approximations
-        return projection.shape, cls()
-
-    def for_camera(self, camera: Camera) -> CenterOrder:
-        """Return this order for one camera; here, it is independent of the camera."""
-        del camera
-        return self
-
-    def keys(self, splats: Splats2D) -> list[Float]:
-        """Return further columns for compositing, if the order needs any."""
-        del splats
-        return []
-
-    def sort_depths(self, splats: Splats2D) -> Float:
-        """Return the sort keys of the splats, Float (N,), in ascending order."""
-        return splats.depths
-
-    def records(self, bins: TileBins) -> Records:
-        """Return the rows that compositing loads, one per sorted entry, evaluated."""
-        return Records.from_ranks(bins, bins.rows.load)
-
-    def composite(self, bins: TileBins, records: Records) -> Layers:
-        """Composite front to back."""
-        return composite(bins, records)
-
-    def adjoint(
-        self,
-        bins: TileBins,
-        records: Records,
-        layers: Layers,
-        d_features: list[Float],
-        d_transmittance: Float,
-        samples: range = ONE_SAMPLE,
-        before: SplatGradients | None = None,
-    ) -> SplatGradients:
-        """See :func:`drgs.splatting.rasterize.composite_adjoint`."""
-        d_planes = d_features, d_transmittance
-        return composite_adjoint(bins, records, layers, *d_planes, samples, before)
-
-    def tangent(
-        self, bins: TileBins, records: Records, layers: Layers, tangents: SplatGradients
-    ) -> Layers:
-        """See :func:`drgs.splatting.rasterize.composite_tangent`."""
-        return composite_tangent(bins, records, layers, tangents)
-
-
 class ProjectionStage(Protocol):
     """The source of a frame's splats, and the destination of their derivatives."""
 
-    def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
+    def project(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
         """Return the splats of the Gaussians for ``camera``."""
         ...
 
     def gradients(
-        self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
+        self,
+        gaussians: Gaussians,
+        frame: Frame,
+        of_splats: SplatGradients,
+        with_camera: bool,
     ) -> GaussianGradients:
         """Return derivatives of the loss, from those with respect to the splats of a frame."""
         ...
 
 
 @dataclass(frozen=True)
-class Projected(ProjectionStage):
+class DirectProjection(ProjectionStage):
     """Project the rendered Gaussians, and differentiate the projection."""
 
     @override
-    def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
-        return project_footprints(gaussians, camera, pipeline)
+    def project(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
+        return project_splats(gaussians, camera, pipeline)
 
     @override
     def gradients(
-        self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
+        self,
+        gaussians: Gaussians,
+        frame: Frame,
+        of_splats: SplatGradients,
+        with_camera: bool,
     ) -> GaussianGradients:
-        found = gradients_of(gaussians, frame.camera, frame.pipeline, of_splats, of_camera)
-        return replace(found, visible=on_film(frame.bins))
+        total = gradients_of(gaussians, frame.camera, frame.pipeline, of_splats, with_camera)
+        return replace(total, visible=on_film(frame.tiles.bins))
 
 
 def load_unchanged(rows: GaussianRows) -> GaussianRows:
@@ -170,12 +112,12 @@ class Pipeline:
     opacity_rule: OpacityRule = plain_opacity
     features: tuple[Feature, ...] = (color_features,)
     rows: Callable[[GaussianRows], GaussianRows] = load_unchanged  # applied before projection
-    shape: Projection = ewa  # projection of mean and covariance
+    shape: FilmProjection = ewa  # projection of mean and covariance
     color: SplatColor = color_at_mean  # stored numbers of a splat's colour
     low_pass: float = LOW_PASS  # px^2
-    model: FootprintModel = DEFAULT
-    order: CenterOrder = CenterOrder()
-    source: ProjectionStage = Projected()
+    model: ImageModel = DEFAULT
+    order: CenterOrder = field(default_factory=CenterOrder)
+    source: ProjectionStage = DirectProjection()
     of_smoothing: bool = False  # whether the smoothing filter is differentiated
 
     def select_differentiable(self, rows: GaussianRows) -> GaussianRows:
@@ -212,16 +154,14 @@ class Frame:
     pipeline: Pipeline
     camera: Camera
     order: CenterOrder  # the pipeline's, for this camera
-    bins: TileBins
-    records: Any  # of that order
-    layers: Layers  # of that order
+    tiles: CompositedTiles  # of that order
 
     def planes(self) -> list[Float]:
         """Return transmittance, then the pipeline's features, unevaluated.
 
         Each is Float (samples * H * W,), sample by sample.
         """
-        return self.layers.planes()
+        return self.tiles.planes()
 
 
 @dataclass(frozen=True)
@@ -244,14 +184,12 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     """
     model = pipeline.model.for_camera(camera)
     grid = TileGrid(camera.width, camera.height, model.positions.samples)
-    bins = bin_footprints(pipeline.source.footprints(gaussians, camera, pipeline), grid, model)
+    bins = bin_splats(pipeline.source.project(gaussians, camera, pipeline), grid, model)
     order = group_features(pipeline.order.for_camera(camera), bins)
-    records = order.records(bins)
-    layers = order.composite(bins, records)
-    return Frame(pipeline, camera, order, bins, records, layers)
+    return Frame(pipeline, camera, order, order.composite(bins, order.records(bins)))
 
 
-def project_footprints(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
+def project_splats(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
     """Project ``gaussians`` and store the inputs of compositing; see :func:`render`."""
     rows = load_rows(gaussians, pipeline.sh_degree)
     splats = pipeline.project(rows, camera)
@@ -259,47 +197,48 @@ def project_footprints(gaussians: Gaussians, camera: Camera, pipeline: Pipeline)
     grid, model = TileGrid(camera.width, camera.height), pipeline.model.for_camera(camera)
     order = pipeline.order.for_camera(camera)
     keys, splats = order.keys(splats), replace(splats, depths=order.sort_depths(splats))
-    return footprints_of(splats, grid, columns, model, keys)
+    return splat_table(splats, grid, columns, model, keys)
 
 
-def render_again(frame: Frame, model: FootprintModel) -> Frame:
+def render_again(frame: Frame, model: ImageModel) -> Frame:
     """Composite the same splats, in the same tiles, with another footprint model.
 
     model: that of the frame's pipeline, except for sample positions within the same margin, or
     features of the same stored numbers.
     """
-    grid = replace(frame.bins.grid, samples=model.positions.samples)
-    bins = replace(frame.bins, grid=grid, model=model.for_camera(frame.camera))
-    return replace(frame, bins=bins, layers=frame.order.composite(bins, frame.records))
+    bins = frame.tiles.bins
+    grid = replace(bins.grid, samples=model.positions.samples)
+    bins = replace(bins, grid=grid, model=model.for_camera(frame.camera))
+    return replace(frame, tiles=frame.order.composite(bins, frame.tiles.records))
 
 
 def frames_adjoint(
     gaussians: Gaussians,
     frames: list[Frame],
     d_planes: list[list[Float]],
-    of_camera: bool = False,
+    with_camera: bool = False,
 ) -> GaussianGradients:
     """Return derivatives of a loss with respect to all parameters.
 
     The loss depends on several frames of the same splats and one camera.
 
     gaussians: the input of ``frames``; d_planes: for each frame, derivatives of the loss with
-    respect to its planes (see :meth:`Frame.planes`); of_camera: also differentiate with respect to
-    the camera. Samples are added in their order.
+    respect to its planes (see :meth:`Frame.planes`); with_camera: also differentiate with respect
+    to the camera. Samples are added in their order.
 
     Raises NotImplementedError if the pipeline has no derivatives with respect to the camera.
 
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
     total = None
-    for frame, (d_transmittance, *d_features) in zip(frames, d_planes, strict=True):
-        bins, inputs = frame.bins, (frame.records, frame.layers, d_features, d_transmittance)
+    for frame, of_frame in zip(frames, d_planes, strict=True):
+        bins = frame.tiles.bins
         at_once = max(1, ENTRIES_AT_ONCE // max(bins.num_entries, dr.width(bins.order)))
         for first in range(0, bins.grid.samples, at_once):
             samples = range(first, min(first + at_once, bins.grid.samples))
-            total = frame.order.adjoint(bins, *inputs, samples, total)
+            total = frame.order.adjoint(frame.tiles, of_frame, samples, total)
     assert total is not None, "there is at least one frame"
-    return frames[0].pipeline.source.gradients(gaussians, frames[0], total, of_camera)
+    return frames[0].pipeline.source.gradients(gaussians, frames[0], total, with_camera)
 
 
 ENTRIES_AT_ONCE = 1 << 19
@@ -312,15 +251,15 @@ def gradients_of(
     camera: Camera,
     pipeline: Pipeline,
     of_splats: SplatGradients,
-    of_camera: bool = False,
+    with_camera: bool = False,
 ) -> GaussianGradients:
     """Return derivatives of the parameters, given those of the 2D splats, by Dr.Jit.
 
     See :func:`frames_adjoint`; ``visible`` does not include the bounds of the film.
     """
-    found, of_rows = gradients_by_row(gaussians, camera, pipeline, of_splats, of_camera)
+    total, by_row = gradients_by_row(gaussians, camera, pipeline, of_splats, with_camera)
     # dr.sum adds in the same order in every run.
-    return replace(found, camera=[dr.sum(each) for each in of_rows]) if of_camera else found
+    return replace(total, camera=[dr.sum(each) for each in by_row]) if with_camera else total
 
 
 def gradients_by_row(
@@ -328,26 +267,21 @@ def gradients_by_row(
     camera: Camera,
     pipeline: Pipeline,
     of_splats: SplatGradients,
-    of_camera: bool,
+    with_camera: bool,
 ) -> tuple[GaussianGradients, list[Float]]:
     """Return :func:`gradients_of`, and each Gaussian's contribution to the camera's derivatives.
 
-    Contributions are evaluated: (N,) for each of ``camera.numbers()``, none without ``of_camera``.
+    Contributions are evaluated: (N,) for each of ``camera.numbers()``; none without
+    ``with_camera``.
     """
     rows = load_rows(gaussians, pipeline.sh_degree)
-    d_rows, visible, d_numbers = _back_to_rows(rows, camera, pipeline, of_splats, of_camera)
+    d_rows, visible, d_numbers = _back_to_rows(rows, camera, pipeline, of_splats, with_camera)
     columns = _columns_of(d_rows, gaussians, visible)
     faults = _nonfinite_flags(d_rows, visible)
     parameters = _as_tensors(columns, gaussians, [faults])
-    of_rows = [dr.select(visible, number, 0) for number in d_numbers]
-    dr.eval(of_rows)
-    found = GaussianGradients(
-        parameters=parameters,
-        means2d=of_splats.means2d,
-        visible=visible,
-        first_nonfinite=dr.min(faults),
-    )
-    return found, of_rows
+    by_row = [dr.select(visible, number, 0) for number in d_numbers]
+    dr.eval(by_row)
+    return GaussianGradients(parameters, of_splats.means2d, visible, dr.min(faults)), by_row
 
 
 @dataclass(frozen=True)
@@ -372,19 +306,19 @@ def sum_of_views(
     rows, faults = load_rows(gaussians, views[0][0].pipeline.sh_degree), []
     total: dict[str, list[Float]] = {}
     for view in views:
-        of_times = []
-        for seen in view:
-            own = dr.copy(rows)  # separates the derivatives of the cameras
-            d_rows, visible, _ = _back_to_rows(own, seen.camera, seen.pipeline, seen.gradients)
+        flags = []
+        for each in view:
+            copy = dr.copy(rows)  # separates the derivatives of the cameras
+            d_rows, visible, _ = _back_to_rows(copy, each.camera, each.pipeline, each.gradients)
             columns = _columns_of(d_rows, gaussians, visible)
             total = _sum_of_columns(total, columns) if total else columns
-            of_times.append(_nonfinite_flags(d_rows, visible))
-        faults.append(reduce(dr.minimum, of_times))
+            flags.append(_nonfinite_flags(d_rows, visible))
+        faults.append(reduce(dr.minimum, flags))
     return _as_tensors(total, gaussians, faults), [dr.min(each) for each in faults]
 
 
 def _sum_of_columns(a: dict[str, list[Float]], b: dict[str, list[Float]]) -> dict[str, list[Float]]:
-    return {name: [x + y for x, y in zip(own, b[name], strict=True)] for name, own in a.items()}
+    return {name: [x + y for x, y in zip(v, b[name], strict=True)] for name, v in a.items()}
 
 
 def _back_to_rows(
@@ -392,26 +326,38 @@ def _back_to_rows(
     camera: Camera,
     pipeline: Pipeline,
     of_splats: SplatGradients,
-    of_camera: bool = False,
+    with_camera: bool = False,
 ) -> tuple[GaussianRows, Bool, list[Float]]:
     """Return derivatives per lane, the visible lanes, and derivatives of the camera's numbers."""
-    falloff, numbers = pipeline.model.for_camera(camera).falloff, []
-    if of_camera:
-        pipeline.model.check_differentiable_in_camera()
-        camera = camera.by_lane(dr.width(rows.logit_opacities))
-        numbers = camera.numbers()
     with dr.resume_grad():
-        dr.enable_grad(pipeline.select_differentiable(rows), numbers)
-        splats = pipeline.project(rows, camera)
-        outputs = falloff.differentiable(splats)
-        outputs += pipeline.feature_columns(splats, rows, camera)
+        inputs, splats, outputs = _attach(rows, camera, pipeline, with_camera)
         cotangents = of_splats.geometry + of_splats.features
         for output, cotangent in zip(outputs, cotangents, strict=True):
             dr.accum_grad(output, cotangent)
         dr.enqueue(dr.ADMode.Backward, outputs)
         dr.traverse(dr.ADMode.Backward)
         d_rows = pipeline.select_differentiable(dr.grad(rows))
-        return d_rows, dr.detach(splats.visible), [dr.grad(number) for number in numbers]
+        return d_rows, dr.detach(splats.visible), [dr.grad(number) for number in inputs[1]]
+
+
+def _attach(
+    rows: GaussianRows, camera: Camera, pipeline: Pipeline, with_camera: bool
+) -> tuple[tuple[GaussianRows, list[Float]], Splats2D, list[Float]]:
+    """Trace the projection again with derivatives.
+
+    Returns its inputs (rows, numbers of the camera), the splats, and the outputs of which
+    :class:`SplatGradients` has the derivatives.
+    """
+    numbers, falloff = [], pipeline.model.for_camera(camera).falloff
+    if with_camera:
+        pipeline.model.check_differentiable_in_camera()
+        camera = camera.by_lane(dr.width(rows.logit_opacities))
+        numbers = camera.numbers()
+    inputs = pipeline.select_differentiable(rows), numbers
+    dr.enable_grad(inputs)
+    splats = pipeline.project(rows, camera)
+    outputs = falloff.differentiable(splats)
+    return inputs, splats, outputs + pipeline.feature_columns(splats, rows, camera)
 
 
 def weighted_sums(frame: Frame, *planes: Float) -> list[Float]:
@@ -422,15 +368,13 @@ def weighted_sums(frame: Frame, *planes: Float) -> list[Float]:
     sum w_i g over pixels: here g is x for the first features and 0 for the rest. This reuses the
     adjoint's kernel, unless colours are evaluated along each pixel's ray.
     """
-    model, samples = frame.bins.model, frame.bins.grid.samples
-    bins = replace(
-        frame.bins, model=replace(model, features=model.features.with_weight_derivatives())
-    )
+    bins, samples = frame.tiles.bins, frame.tiles.bins.grid.samples
+    features = bins.model.features.with_weight_derivatives()
+    tiles = replace(frame.tiles, bins=replace(bins, model=replace(bins.model, features=features)))
     repeated = [repeat_array(plane, samples) for plane in planes]
     zeros = dr.opaque(type(repeated[0]), 0, dr.width(repeated[0]))
-    d_features = [*repeated, *[zeros] * (frame.layers.count - len(planes))]
-    inputs = frame.records, frame.layers, d_features, zeros
-    gradients = frame.order.adjoint(bins, *inputs, range(samples))
+    d_planes = [zeros, *repeated, *[zeros] * (tiles.count - len(planes))]
+    gradients = frame.order.adjoint(tiles, d_planes, range(samples))
     return gradients.features[: len(planes)]
 
 
@@ -450,12 +394,8 @@ def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGrad
 
 
 def _sum_of(a: Gaussians, b: Gaussians) -> Gaussians:
-    total = {name: getattr(a, name) + getattr(b, name) for name in PARAMETER_NAMES}
-    if a.smoothing is not None:
-        total["smoothing"] = a.smoothing + b.smoothing
-    if a.features and b.features:
-        total["features"] = {name: v + b.features[name] for name, v in a.features.items()}
-    return Gaussians(**total)
+    others = b.arrays
+    return Gaussians.from_arrays({name: v + others[name] for name, v in a.arrays.items()})
 
 
 def decode_nonfinite(fault: int) -> tuple[int, str] | None:
@@ -489,7 +429,7 @@ def frames_tangent(
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
     direction = _splat_tangents(gaussians, frames[0], tangents, camera_tangents)
-    return [f.order.tangent(f.bins, f.records, f.layers, direction).planes() for f in frames]
+    return [frame.order.tangent(frame.tiles, direction) for frame in frames]
 
 
 def _splat_tangents(
@@ -499,29 +439,18 @@ def _splat_tangents(
     camera_tangents: list[Float] | None = None,
 ) -> SplatGradients:
     """Return tangents of the 2D splats, given those of the parameters, by Dr.Jit."""
-    rows = load_rows(gaussians, frame.pipeline.sh_degree)
-    camera, numbers = frame.camera, []
-    if camera_tangents is not None:
-        frame.pipeline.model.check_differentiable_in_camera()
-        camera = camera.by_lane(dr.width(rows.logit_opacities))
-        numbers = camera.numbers()
+    pipeline, with_camera = frame.pipeline, camera_tangents is not None
+    rows = load_rows(gaussians, pipeline.sh_degree)
+    d_rows = load_rows(tangents, pipeline.sh_degree)
     with dr.resume_grad():
-        differentiated = frame.pipeline.select_differentiable(rows)
-        dr.enable_grad(differentiated, numbers)
-        splats = frame.pipeline.project(rows, camera)
-        d_rows = load_rows(tangents, frame.pipeline.sh_degree)
-        dr.set_grad(differentiated, frame.pipeline.select_differentiable(d_rows))
-        for number, tangent in zip(numbers, camera_tangents or [], strict=True):
-            dr.set_grad(number, tangent)
-        falloff = frame.bins.model.falloff
-        outputs = falloff.differentiable(splats)
-        outputs += frame.pipeline.feature_columns(splats, rows, camera)
+        inputs, _, outputs = _attach(rows, frame.camera, pipeline, with_camera)
+        dr.set_grad(inputs, (pipeline.select_differentiable(d_rows), camera_tangents or []))
         # Some outputs (depths, p of the conic factor) are inputs of others: the default would clear
         # the derivatives of such interior variables on the way.
         dr.forward_to(outputs, flags=dr.ADFlag.ClearEdges)
         columns = [dr.grad(output) for output in outputs]
     dr.eval(columns)
-    count = falloff.num_geometry
+    count = frame.tiles.bins.model.falloff.num_geometry
     return SplatGradients(geometry=columns[:count], features=columns[count:])
 
 
@@ -540,9 +469,9 @@ def _columns_of(
     columns["smoothing"] = [] if d_rows.smoothing is None else [d_rows.smoothing]
     columns |= d_rows.features or {}
     return {
-        name: [dr.select(visible, column, t.Float(0)) for column in own]
-        for name, own in columns.items()
-        if len(own)
+        name: [dr.select(visible, component, t.Float(0)) for component in components]
+        for name, components in columns.items()
+        if len(components)
     }
 
 
@@ -563,7 +492,7 @@ def _as_tensors(
 ) -> Gaussians:
     """Return columns as tensors shaped like the parameters, evaluated together with ``others``."""
     t = types_of(type(gaussians.logit_opacities))
-    stored = {name: store_columns(own) for name, own in columns.items()}
+    stored = {name: store_columns(c) for name, c in columns.items()}
     dr.eval(stored, others)
 
     def gradient(name: str, like: TensorXf | Float) -> TensorXf | Float:
@@ -572,19 +501,10 @@ def _as_tensors(
         flat = first_numbers(stored[name], dr.width(like))
         return t.TensorXf(flat, like.shape) if dr.is_tensor_v(like) else flat
 
-    smoothing, features = gaussians.smoothing, gaussians.features
-    parameters: dict[str, Any] = {
-        name: gradient(name, getattr(gaussians, name)) for name in PARAMETER_NAMES
-    }
-    return Gaussians(
-        **parameters,
-        smoothing=(
-            gradient("smoothing", smoothing)
-            if smoothing is not None and "smoothing" in stored
-            else None
-        ),
-        features=features and {name: gradient(name, like) for name, like in features.items()},
-    )
+    likes = gaussians.arrays
+    if "smoothing" not in stored:  # it is not differentiated
+        likes.pop("smoothing", None)
+    return Gaussians.from_arrays({name: gradient(name, like) for name, like in likes.items()})
 
 
 def _nonfinite_flags(d_rows: GaussianRows, visible: Bool) -> UInt32:

@@ -1,6 +1,6 @@
-"""Binning: lists of the splats that touch each tile, front to back.
+"""Binning: lists of the splats that touch each tile, front to back, and iteration over them.
 
-The second stage: ``Splats2D`` -> ``Footprints`` -> ``TileBins``. The image is divided into tiles of
+The second stage: ``Splats2D`` -> ``SplatTable`` -> ``TileBins``. The image is divided into tiles of
 16x16 pixels, each a 4x4 grid of micro-tiles of 4x4 pixels. Every (splat, tile) pair of a splat's
 bounding box is one *entry*, with a mask of 16 bits for the micro-tiles that its ellipse touches. No
 lane loops over a splat's tiles, so a giant splat does not delay its neighbours, and the host reads
@@ -12,22 +12,27 @@ one value, the number of entries.
 4. Stable sort of the entries by tile; within a tile they remain front to back.
 5. Transpose the bits: for each group of 32 entries and each micro-tile one 32-bit word, so that
    compositing finds a micro-tile's next splat as the lowest bit.
+
+A lane of compositing iterates over the :class:`Entries` of its tile, front to back or back to
+front, and visits those whose bit in its words is set.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import drjit as dr
+from typing_extensions import override
 
 from drgs.cameras.lens import shortest
-from drgs.core.arrays import Rows, interleave, types_of
+from drgs.core.arrays import Rows, interleave, reinterpret, types_of
 from drgs.core.errors import UserError
-from drgs.core.private import bucket_order
-from drgs.core.types import Float, UInt32
-from drgs.splatting.footprint import DEFAULT, FootprintModel
-from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
+from drgs.core.private import access_all_lanes, bucket_order
+from drgs.core.types import Bool, Float, UInt32
+from drgs.splatting.footprint import DEFAULT, ImageModel
+from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid
 from drgs.splatting.projection import Splats2D
 
 WORD = 32  # entries in a word of the transposed masks
@@ -55,7 +60,7 @@ class TileBins:
     tile_start: UInt32  # (tiles + 1,): tile -> first sorted entry
     num_entries: int  # M
     grid: TileGrid
-    model: FootprintModel
+    model: ImageModel
 
     @property
     def num_sums(self) -> int:
@@ -64,7 +69,7 @@ class TileBins:
 
 
 @dataclass(frozen=True)
-class Footprints:
+class SplatTable:
     """The stored inputs of binning and compositing: a row per splat.
 
     Concatenated rows of several objects are binned as if they had been projected together, because
@@ -78,32 +83,32 @@ class Footprints:
     num_keys: int
 
 
-def footprints_of(
+def splat_table(
     splats: Splats2D,
     grid: TileGrid,
     features: Sequence[Float] = (),
-    model: FootprintModel = DEFAULT,
+    model: ImageModel = DEFAULT,
     keys: Sequence[Float] = (),
-) -> Footprints:
+) -> SplatTable:
     """Store ``splats`` for binning, evaluated.
 
     features: columns, Float (N,) each, to composite; keys: further columns, for the order. Neither
     they nor the splats need to be evaluated: the kernel that computes them stores the rows.
     """
     boxes, rows, depths = _store_rows(splats, grid, [*features, *keys], model)
-    return Footprints(boxes, rows, depths, len(features), len(keys))
+    return SplatTable(boxes, rows, depths, len(features), len(keys))
 
 
-def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel) -> TileBins:
+def bin_splats(table: SplatTable, grid: TileGrid, model: ImageModel) -> TileBins:
     """Distribute splats over the tiles of ``grid``, front to back.
 
     Not differentiated. The host reads one value, the number of entries.
 
     Raises UserError if there are more than 2^26 Gaussians.
     """
-    boxes, rows, depths = footprints.boxes, footprints.rows, footprints.depths
-    num_features, num_keys = footprints.num_features, footprints.num_keys
-    del footprints  # releases its arrays before the function ends
+    boxes, rows, depths = table.boxes, table.rows, table.depths
+    num_features, num_keys = table.num_features, table.num_keys
+    del table  # releases its arrays before the function ends
     t = types_of(type(depths))
     if dr.width(depths) > 1 << _RANK_BITS:
         raise UserError(
@@ -154,7 +159,7 @@ def bin_footprints(footprints: Footprints, grid: TileGrid, model: FootprintModel
 
 
 def _store_rows(
-    splats: Splats2D, grid: TileGrid, stored: Sequence[Float], model: FootprintModel
+    splats: Splats2D, grid: TileGrid, stored: Sequence[Float], model: ImageModel
 ) -> tuple[Rows, Rows, Float]:
     """Return, by Gaussian, boxes of tiles, all other numbers, and depths to sort by; evaluated."""
     geometry = model.falloff.geometry(splats)
@@ -167,7 +172,7 @@ def _store_rows(
     return boxes, rows, depths
 
 
-def _reach(geometry: list[Float], grid: TileGrid, model: FootprintModel) -> Float:
+def _reach(geometry: list[Float], grid: TileGrid, model: ImageModel) -> Float:
     """Return |U d|^2 (base 2) at which a splat ends, with a margin for rounding.
 
     For the default cut-offs, sqrt(2 ln(opacity / alpha_cut)) standard deviations: the
@@ -179,7 +184,7 @@ def _reach(geometry: list[Float], grid: TileGrid, model: FootprintModel) -> Floa
 
 
 def _tile_box(
-    splats: Splats2D, geometry: list[Float], grid: TileGrid, model: FootprintModel
+    splats: Splats2D, geometry: list[Float], grid: TileGrid, model: ImageModel
 ) -> list[Float]:
     """Return first column and row, columns, and number of tiles: integers, exact up to 2^24."""
     t = types_of(type(splats.depths))
@@ -234,7 +239,7 @@ def _make_entries(
     rows: Rows,
     num_entries: int,
     grid: TileGrid,
-    model: FootprintModel,
+    model: ImageModel,
 ) -> tuple[UInt32, UInt32]:
     """Return the tile of each entry, and two words: see :func:`_pack`.
 
@@ -277,7 +282,7 @@ def _pack(rank: UInt32, tile: UInt32, mask: UInt32) -> list[UInt32]:
     """Pack an entry into two words: 26 bits of rank, 22 of tile, 16 of mask.
 
     2^22 tiles have 2^30 pixels; four planes of them exceed an array of Dr.Jit. More ranks are
-    refused by :func:`bin_footprints`.
+    refused by :func:`bin_splats`.
     """
     return [rank | ((tile >> MICROS) << _RANK_BITS), mask | (tile << MICROS)]
 
@@ -298,7 +303,7 @@ def stable_order(keys: UInt32, bound: int) -> UInt32:
 
 
 def _touched_micros(
-    geometry: list[Float], tile_x: UInt32, tile_y: UInt32, grid: TileGrid, model: FootprintModel
+    geometry: list[Float], tile_x: UInt32, tile_y: UInt32, grid: TileGrid, model: ImageModel
 ) -> UInt32:
     """Return a mask: bit m is set if the ellipse alpha >= cut reaches a pixel of micro-tile m.
 
@@ -386,3 +391,128 @@ def lower_bounds(sorted_tiles: UInt32, num_entries: int, num_tiles: int) -> UInt
         labels=("first", "last"),
     )
     return first
+
+
+@dataclass
+class Cursor:
+    """A place among the set bits of a micro-tile's words: the splats that touch it.
+
+    Not frozen: Dr.Jit assigns the fields of a loop's state.
+    """
+
+    word: UInt32  # bits of the current group that are still to come
+    group: UInt32  # index of the current group of 32 entries
+
+
+class Entries:
+    """The entries [start, end) of each lane's tile that touch its micro-tile, front to back."""
+
+    def __init__(self, bins: TileBins, lanes: Lanes, end: UInt32) -> None:
+        UInt32 = type(lanes.tile)
+        self.words, self.micro, self.sample = bins.words, lanes.micro, lanes.sample
+        start = dr.gather(UInt32, bins.tile_start, lanes.tile)
+        occupied = start < end
+        # An empty lane gets first == last and no bits: it is over before it begins.
+        self.first = dr.select(occupied, start // WORD, 0)
+        self.last = dr.select(occupied, (end - 1) // WORD, 0)
+        ones = UInt32(0xFFFFFFFF)
+        self.head = dr.select(occupied, ones << (start % WORD), 0)
+        self.tail = dr.select(occupied, ones >> (WORD - 1 - (end - 1) % WORD), 0)
+
+    def begin(self) -> Cursor:
+        """The cursor at the first entry."""
+        return self._open(self.first)
+
+    def pending(self, cursor: Cursor) -> Bool:
+        """Return lanes that may have entries left."""
+        return (cursor.word != 0) | (cursor.group < self.last)
+
+    @staticmethod
+    def current(cursor: Cursor) -> tuple[UInt32, Bool]:
+        """The current sorted entry, and whether there is one (a word may be empty).
+
+        Where there is none, it is one of the entries of the cursor's group.
+        """
+        return cursor.group * WORD + find_lowest_bit(cursor.word), cursor.word != 0
+
+    def advance(self, cursor: Cursor) -> Cursor:
+        """Drop the current entry; open the next group when this one is used up."""
+        word = cursor.word & (cursor.word - 1)
+        return self._go_on(cursor, word, cursor.group + 1, cursor.group < self.last)
+
+    def _go_on(self, cursor: Cursor, word: UInt32, neighbor: UInt32, has_neighbor: Bool) -> Cursor:
+        used_up = (word == 0) & has_neighbor
+        with access_all_lanes(type(word)):  # every lane has a group
+            opened = self._open(dr.select(used_up, neighbor, cursor.group))
+        return Cursor(word=dr.select(used_up, opened.word, word), group=opened.group)
+
+    def _open(self, group: UInt32) -> Cursor:
+        t = types_of(type(group))
+        pair = dr.gather(t.Array2u, self.words, group * (MICROS // 2) + self.micro // 2)
+        word = dr.select((self.micro & 1) != 0, pair[1], pair[0])
+        word &= dr.select(group == self.first, self.head, 0xFFFFFFFF)
+        word &= dr.select(group == self.last, self.tail, 0xFFFFFFFF)
+        return Cursor(word=word, group=group)
+
+
+class EntriesBackToFront(Entries):
+    """The same entries in the opposite order."""
+
+    @override
+    def begin(self) -> Cursor:
+        """The cursor at the last entry."""
+        return self._open(self.last)
+
+    @override
+    def pending(self, cursor: Cursor) -> Bool:
+        return (cursor.word != 0) | (cursor.group > self.first)
+
+    @staticmethod
+    @override
+    def current(cursor: Cursor) -> tuple[UInt32, Bool]:
+        return cursor.group * WORD + _find_highest_bit(cursor.word), cursor.word != 0
+
+    @override
+    def advance(self, cursor: Cursor) -> Cursor:
+        """Drop the current entry; open the group before when this one is used up."""
+        word = cursor.word & ~(type(cursor.word)(1) << _find_highest_bit(cursor.word))
+        return self._go_on(cursor, word, cursor.group - 1, cursor.group > self.first)
+
+
+def count_entries(entries: Entries) -> UInt32:
+    """Count the entries of each lane."""
+
+    def body(group: UInt32, count: UInt32) -> tuple[UInt32, UInt32]:
+        return group + 1, count + dr.popcnt(entries._open(group).word)
+
+    UInt32 = type(entries.first)
+    _, count = dr.while_loop(
+        state=(UInt32(entries.first), dr.zeros(UInt32, dr.width(entries.first))),
+        cond=lambda group, count: group <= entries.last,
+        body=body,
+    )
+    return count
+
+
+def find_lowest_bit(word: UInt32) -> UInt32:
+    """Return the index of the lowest bit that is set, by the exponent of a floating point number.
+
+    AVX2 has no instruction for it. Of no bit: 1.
+    """
+    return _exponent(_to_float(word & (0 - word))) & (WORD - 1)
+
+
+def _find_highest_bit(word: UInt32) -> UInt32:
+    """Return the index of the highest bit that is set; of no bit: 0."""
+    # The bit below the highest one is removed, or the conversion could round up to the next power.
+    return _exponent(_to_float((word & ~(word >> 1)) >> 1) + 0.5) + 1
+
+
+def _to_float(word: UInt32) -> Float:
+    Float32 = cast("type[Float]", dr.float32_array_t(type(word)))
+    return Float32(reinterpret(dr.int32_array_t(type(word)), word))
+
+
+def _exponent(value: Float) -> UInt32:
+    """Return the exponent; of negative numbers, 32 is to be divided out."""
+    return (reinterpret(dr.uint32_array_t(type(value)), value) >> 23) - 127

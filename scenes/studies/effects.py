@@ -50,7 +50,7 @@ class RenderingCase:
     scene: Mapping[str, object] = field(default_factory=dict)
     sh_degree: int = 3
     smoothing: bool = False
-    of_camera: bool = False  # differentiate pose and lens
+    with_camera: bool = False  # differentiate pose and lens
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def rendering_cases() -> list[RenderingCase]:
         RenderingCase("motion", "rolling shutter", moving | {"shutter": "rolling"}),
         RenderingCase("antialiasing", "opacity compensation", integrator={"antialiased": True}),
         RenderingCase("antialiasing", "3D smoothing filter", smoothing=True),
-        RenderingCase("camera refinement", "pose and focal lengths", calibrated, of_camera=True),
+        RenderingCase("camera refinement", "pose and focal lengths", calibrated, with_camera=True),
     ]
 
 
@@ -172,7 +172,7 @@ class CaseRenderer:
         )
         self.params = mi.traverse(self.scene)
         self.differentiated = [f"integrator.{name}" for name in PARAMETER_NAMES]
-        if case.of_camera:
+        if case.with_camera:
             self.differentiated += ["sensor.to_world", "sensor.fx", "sensor.fy"]
         for name in self.differentiated:
             dr.enable_grad(self.params[name])

@@ -59,7 +59,7 @@ class LightMode:
 LIGHT_MODES = (
     LightMode("none", {"light": "none"}),
     LightMode("probe", {"light": "probe"}),
-    LightMode("probe, unseen by rays", {"light": "probe", "unseen": "rays"}),
+    LightMode("probe, unseen by rays", {"light": "probe", "probe_fallback": "rays"}),
     LightMode("rays", {"light": "rays"}),
 )
 
@@ -166,8 +166,8 @@ def _stage(place: mi.ScalarTransform4f, integrator: dict[str, object]) -> dict[s
 
 def mask_of(scene: mi.Scene, name: str) -> np.ndarray:
     """Return (H, W) bool: pixels whose centre shows a shape that no splats cover."""
-    from drgs.integrator.rays import PathSegment
-    from drgs.integrator.splat_transport import RayTransport
+    from drgs.integrator.light.rays import PathSegment
+    from drgs.integrator.light.splat_transport import RayTransport
 
     sensor, integrator = scene.sensors()[0], scene.integrator()
     width, height = sensor.film().crop_size()

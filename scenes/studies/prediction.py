@@ -188,7 +188,7 @@ def measure_costs(task: Task) -> Costs:
         pose, focal = view.camera_to_world, view.fx
         middle = task.size_px / 2, task.size_px / 2, task.size_px, task.size_px
         camera = Camera(pose[:3, :3].T, pose[:3, 3], focal, focal, *middle)
-        bins = frame_of(Scene(view.name, gaussians, camera)).bins
+        bins = frame_of(Scene(view.name, gaussians, camera)).tiles.bins
         splats.append(int(dr.count(on_film(bins))[0]))
     dataset = Dataset(views, views[:1], "bench", (1.0, 1.0, 1.0), None, "bench")
     trainer = Trainer(bench_config(gaussians), dataset, gaussians)

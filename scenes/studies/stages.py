@@ -27,9 +27,9 @@ from drgs.core.types import UInt32
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 from drgs.reference import splatting as reference
-from drgs.splatting import rasterize, rendering, tiles
-from drgs.splatting.grid import PIXELS
-from drgs.splatting.lanes import Cursor, Entries, load_lane_row, make_lanes
+from drgs.splatting import order, rasterize, rendering, tiles
+from drgs.splatting.grid import PIXELS, load_lane_row, make_lanes
+from drgs.splatting.tiles import Cursor, Entries
 from drgs.training.trainer import Trainer
 
 STAGES = (
@@ -94,9 +94,9 @@ def stage_clock() -> Iterator[StageClock]:
 
     borders = [
         (tiles, "_store_rows", None, "projection and SH"),
-        (rendering, "bin_footprints", None, "binning"),
-        (rendering, "composite", None, "compositing"),
-        (rendering, "composite_adjoint", "image and loss", None),
+        (rendering, "bin_splats", None, "binning"),
+        (order, "composite", None, "compositing"),
+        (order, "composite_adjoint", "image and loss", None),
         (rasterize, "sum_entries", "adjoint", "reduction"),
         (rasterize, "splat_gradients", None, "reduction"),
         (rendering, "_as_tensors", None, "projection and SH, adjoint"),
@@ -207,17 +207,17 @@ class Work:
 
 def count_work(frame: rendering.Frame) -> Work:
     """Count the frame's entries and pairs."""
-    bins, layers = frame.bins, frame.layers
+    composited, bins = frame.tiles, frame.tiles.bins
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
-    stop = dr.gather(t.UInt32, layers.stop, lanes.micro_tile)
+    stop = dr.gather(t.UInt32, composited.stop, lanes.micro_tile)
     entries = Entries(bins, lanes, stop)
-    ends = load_lane_row(layers.ends, lanes.micro_tile, 1)
+    ends = load_lane_row(composited.ends, lanes.micro_tile, 1)
     model = bins.model.bind(lanes, bins.grid)
 
     def body(cursor: Cursor, visited: UInt32, useful: UInt32) -> tuple[Cursor, UInt32, UInt32]:
         entry, active = entries.current(cursor)
-        geometry, _ = frame.records.load(entry, active)
+        geometry, _ = composited.records.load(entry, active)
         footprint = model.footprint(geometry, lanes, active)
         for pixel, alpha in enumerate(model.alphas(geometry, footprint)):
             useful = useful + dr.select((alpha.value > 0) & (entry < ends[pixel]), t.UInt32(1), 0)

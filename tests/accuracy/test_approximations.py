@@ -19,6 +19,7 @@ from support.helpers import (
     single,
 )
 from support.kernels import float_reductions
+from support.reference_lenses import gaussians_at
 
 from drgs.accuracy import pixel_order
 from drgs.accuracy.pipeline import pipeline_of
@@ -45,16 +46,11 @@ def test_order_converges_with_the_window():
 
 def on_axis(logits, sizes) -> reference.Gaussians:
     """Round splats behind each other, sizes relative to their depths."""
-    count = len(logits)
-    z = np.linspace(2, 4, count)
-    return reference.Gaussians(
-        means=single(np.column_stack([0 * z, 0 * z, z])),
-        quats=np.tile([1.0, 0, 0, 0], (count, 1)),
-        log_scales=single(np.log(np.full((count, 3), sizes) * z[:, None])),
-        logit_opacities=single(logits),
-        sh0=single(np.random.default_rng(0).normal(size=(count, 1, 3))),
-        shN=np.zeros((count, 0, 3)),
-    )
+    z = np.linspace(2, 4, len(logits))
+    found = gaussians_at(single(np.column_stack([0 * z, 0 * z, z])), sizes * z[:, None])
+    sh0 = single(np.random.default_rng(0).normal(size=(len(z), 1, 3)))
+    scales = single(found.log_scales)
+    return replace(found, log_scales=scales, logit_opacities=single(logits), sh0=sh0)
 
 
 CAMERA = reference.Camera(np.eye(3), np.zeros(3), 20.0, 20.0, 8.0, 8.0, 16, 16)
@@ -139,7 +135,6 @@ CHOSEN_MODULES = (
     "exact", "pixel_lists", "pixel_order", "ray_colors",
     "unscented",
 )  # fmt: skip
-
 
 PROGRAM = """
 import json, sys

@@ -14,7 +14,7 @@ from unittest import mock
 import drjit as dr
 import numpy as np
 import pytest
-from support.conditioning import U, color_share, opacity_size, rounded_inputs
+from support.conditioning import U, color_share, opacity_size, rms, rounded_inputs
 from support.hard_cases import EXACT, FAMILIES, bound_of, errors_over_bounds
 from support.helpers import (
     FLOAT32,
@@ -87,17 +87,7 @@ def noises(case, pipeline, weights, base) -> tuple[dict, dict]:
         with rounded_axes(sample):
             moved.append(planes_and_gradients(gaussians, camera, pipeline, weights, FLOAT64))
 
-    def change(values, samples):
-        result = {}
-        for key, value in values.items():
-            noise = np.sqrt(np.mean([(sample[key] - value) ** 2 for sample in samples], axis=0))
-            # Vectors have one noise, their largest.
-            if noise.ndim > 1 and noise.size:
-                noise = np.broadcast_to(noise.max(axis=-1, keepdims=True), noise.shape)
-            result[key] = noise
-        return result
-
-    return tuple(change(b, [m[k] for m in moved]) for k, b in enumerate(base))
+    return tuple(rms([m[k] for m in moved], b) for k, b in enumerate(base))
 
 
 def rounded_appearance(rng, gaussians) -> reference.Gaussians:

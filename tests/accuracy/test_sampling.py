@@ -10,7 +10,7 @@ import pytest
 from support.backgrounds import CLOSE, EMITTERS, rendered, texels
 from support.cases import CASES, MODEL_FIELDS, planes_of, reference_camera
 from support.helpers import FLOAT64, NEAR_THRESHOLD, single
-from support.views import VIEWS, Scene, image_of, tensors
+from support.views import VIEWS, Scene, image_of, side_by_side, tensors
 from support.wall_scenes import Wall
 from support.wall_scenes import load as load_wall
 
@@ -299,28 +299,18 @@ def scene_with(settings=(), sensor=None, **objects):
 
 
 def batch_of_two():
-    whole = SMALL_SCENE.view.sensor()
-    whole["film"]["width"] *= 2
-    children = {"a": SMALL_SCENE.view.sensor(), "b": VIEWS[2].sensor()}
-    return {"type": "batch", "film": whole["film"], "sampler": whole["sampler"], **children}
+    return side_by_side(SMALL_SCENE.view, VIEWS[2])
 
 
 def thin_lens():
-    common = {name: SMALL_SCENE.view.sensor()[name] for name in ("film", "sampler", "to_world")}
-    return {
-        "type": "thinlens",
-        "fov": 50.0,
-        "aperture_radius": 0.05,
-        "focus_distance": 2.3,
-    } | common
+    lens = {"fov": 50.0, "aperture_radius": 0.05, "focus_distance": 2.3}
+    return SMALL_SCENE.view.with_sensor("thinlens", **lens).sensor()
 
 
 def moving():
-    common = {name: SMALL_SCENE.view.sensor()[name] for name in ("film", "sampler", "to_world")}
     lens = {"fx": 30.0, "fy": 27.0, "cx": 17.0, "cy": 12.5, "shutter": "global"}
-    close = mi.ScalarTransform4f(CLOSE)
-    moves = {"to_world_close": close, "shutter_samples": 2}
-    return {"type": "calibrated", **lens, **common, **moves}
+    moves = {"to_world_close": mi.ScalarTransform4f(CLOSE), "shutter_samples": 2}
+    return SMALL_SCENE.view.with_sensor("calibrated", **lens, **moves).sensor()
 
 
 def feature_tensor(channels):
@@ -372,7 +362,7 @@ def outcome(name, samples=3) -> tuple[dict[str, np.ndarray], int]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_passes_of_several_samples_equal_single_sample_passes(name, monkeypatch):
-    monkeypatch.setattr("drgs.splatting.feature_groups.FEATURES_AT_ONCE", {4: 4, 8: 4})
+    monkeypatch.setattr("drgs.splatting.order.FEATURES_AT_ONCE", {4: 4, 8: 4})
     monkeypatch.setattr("drgs.integrator.film.PIXELS_PER_PASS", 1)
     expected, passes = outcome(name)
     assert passes == 3
@@ -384,7 +374,7 @@ def test_passes_of_several_samples_equal_single_sample_passes(name, monkeypatch)
         return passes
 
     monkeypatch.undo()
-    monkeypatch.setattr("drgs.splatting.feature_groups.FEATURES_AT_ONCE", {4: 4, 8: 4})
+    monkeypatch.setattr("drgs.splatting.order.FEATURES_AT_ONCE", {4: 4, 8: 4})
     assert check() == 1
     with monkeypatch.context() as patch:
         patch.setattr("drgs.splatting.rendering.ENTRIES_AT_ONCE", 1)

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.kernels import kernel_hashes
 from support.sensors import PIXELS, camera_of, numbers, points_on_rays, project
 from support.views import VIEWS, View, pose
 
@@ -69,11 +70,7 @@ def test_sensors_of_all_poses_and_sizes_share_kernels():
         sensor = mi.load_dict(
             {"type": "perspective", "film": film, "fov": fov, "to_world": pose_of_sensor}
         )
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            camera = camera_from_sensor(read_sensor(sensor, 0.01))
-            dr.eval(camera)
-            return {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
+        return kernel_hashes(lambda: dr.eval(camera_from_sensor(read_sensor(sensor, 0.01))))
 
     first = kernels(width=33, height=21)
     assert first and kernels(fov=50.0, turn=70, width=57, height=40) == first

@@ -41,7 +41,7 @@ def scene(scale, count=60):
     points = rng.normal(size=(count, 3))
     scales = scale * rng.uniform(0.3, 1.5, (count, 3)) * np.linalg.norm(points, axis=1)[:, None]
     quats = rng.normal(size=4)
-    return gaussians_at(points, scales, rng.uniform(0.2, 0.9, count), quats, rng.random((count, 3)))
+    return gaussians_at(points, scales, rng.uniform(0.2, 0.9, count), rng.random((count, 3)), quats)
 
 
 @both_precisions

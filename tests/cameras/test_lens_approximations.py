@@ -4,19 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.helpers import (
-    FLOAT64,
-    clear,
-    device_gaussians,
-    rows,
-)
+from support.cases import reference_camera, with_lens
+from support.helpers import FLOAT64, device_gaussians, rows
 from support.lens_scenes import (
+    FOCAL,
     FORMS,
     IMAGE,
     LENSES,
-    LensCase,
     camera_behind,
-    case_of,
     covariances,
     every_lens,
     gaussians_at_points,
@@ -38,7 +33,7 @@ from drgs.splatting import rendering
 
 def unscented_scene(name, size) -> tuple[reference.Gaussians, reference.Camera]:
     """20 Gaussians on the film of up to ``size`` of their distance; none nearer than 0.5."""
-    lens, camera = LENSES[name], camera_behind(case_of(name), np.random.default_rng(1))
+    lens, camera = LENSES[name], camera_behind(LENSES[name], seed=1)
     rng = np.random.default_rng(2)
     film = rng.uniform(0.2, 0.8, (20, 2)) * [camera.width, camera.height]
     points = points_at(lens, camera, film, rng.uniform(1, 3, 20))
@@ -74,16 +69,13 @@ def test_unscented_splats_have_the_mean_and_covariance_of_projected_samples(name
     assert errors.max() < 0.004
 
 
-PIXEL_COLORS = {"sh_direction": "pixel"}
-
-
-def direction_of_pixels(case) -> np.ndarray:
+def direction_of_pixels(lens, camera) -> np.ndarray:
     """(H W, 3), unit, world: of the rays of pixel centres, by the reference; NaN: nothing."""
-    y, x = np.mgrid[: case.height, : case.width].reshape(2, -1) + 0.5
-    points = points_at(case.lens, case.camera, np.column_stack([x, y]), np.ones(x.size))
-    if isinstance(case.lens, Orthographic):
+    y, x = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
+    points = points_at(lens, camera, np.column_stack([x, y]), np.ones(x.size))
+    if isinstance(lens, Orthographic):
         points = np.tile([0, 0, 1.0], (x.size, 1))
-    world = points @ case.camera.rotation
+    world = points @ camera.rotation
     return world / np.linalg.norm(world, axis=1, keepdims=True)
 
 
@@ -91,13 +83,15 @@ def direction_of_pixels(case) -> np.ndarray:
 @pytest.mark.parametrize("name", FORMS)
 def test_colours_use_the_directions_of_pixel_rays(name):
     """One reference image for each pixel, of that pixel."""
-    case = clear(LensCase("small", 12, 9, 1, 20, lens=LENSES[name]))
-    _, frame = case.render(FLOAT64, pipeline_of(Approximations(**PIXEL_COLORS), 1))
-    color = planes_of(frame)[1:].T
-    splats = effects.project(*case.scene, case.lens)
+    lens, options = LENSES[name], {"approximations": {"sh_direction": "pixel"}, "count": 20}
+    focal = FOCAL.get(type(lens), 26.0) * 12 / 37
+    case = with_lens(name, width=12, height=9, focal=focal, **options)
+    gaussians, camera = reference.Gaussians(**case.values), reference_camera(case)
+    color = case.planes(case.values)[1:4].T
+    splats = effects.project(gaussians, camera, lens)
     expected = np.zeros((case.height * case.width, 3))
-    directions_of = direction_of_pixels(case)
-    coefficients = np.concatenate([case.gaussians.sh0, case.gaussians.shN], axis=1)
+    directions_of = direction_of_pixels(lens, camera)
+    coefficients = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
     for pixel, direction in enumerate(directions_of):
         colors = 0.5 + reference.sh_basis(direction[None], 1)[0] @ coefficients
         offset = np.array([pixel % case.width, pixel // case.width])
@@ -116,18 +110,15 @@ def test_colours_use_the_directions_of_pixel_rays(name):
 )
 def test_pixel_order_equals_center_order_for_separate_layers(name):
     """Flat splats in layers far apart, so that no pixel's order is another one."""
-    case = case_of(name)
-    camera = camera_behind(case, np.random.default_rng(0))
-    rng = np.random.default_rng(1)
+    lens, camera, rng = LENSES[name], camera_behind(LENSES[name]), np.random.default_rng(1)
     film = rng.uniform(0.2, 0.8, (12, 2)) * [camera.width, camera.height]
-    points = points_at(case.lens, camera, film, np.linspace(1, 8, 12))
+    points = points_at(lens, camera, film, np.linspace(1, 8, 12))
     points = points[~np.isnan(points).any(axis=1)]
-    gaussians = gaussians_at_points(
-        case, rng, camera, points, np.full((len(points), 3), 0.9), np.full(len(points), 0.5)
-    )
+    sizes, logits = np.full((len(points), 3), 0.9), np.full(len(points), 0.5)
+    gaussians = gaussians_at_points(lens, rng, camera, points, sizes, logits, degree=1)
     gaussians = replace(gaussians, log_scales=gaussians.log_scales - 0.5)
     device = device_gaussians(gaussians, FLOAT64)
-    device_camera = lens_camera(camera, case.lens, FLOAT64)
+    device_camera = lens_camera(camera, lens, FLOAT64)
     plain, ordered = (
         planes_of(rendering.render(device, device_camera, pipeline_of(approximations, 1)))
         for approximations in (Approximations(), Approximations(order="pixel", order_window=2))
@@ -136,13 +127,12 @@ def test_pixel_order_equals_center_order_for_separate_layers(name):
     np.testing.assert_allclose(ordered, plain, rtol=0, atol=1e-13)
 
 
-def composited_along_parallel_rays(case, low_pass=0.3) -> tuple[np.ndarray, int]:
+def composited_along_parallel_rays(gaussians, camera, low_pass=0.3) -> tuple[np.ndarray, int]:
     """(4, H W): transmittance and colour; each pixel's splats by the depths of their peaks. And how
     many of these would show, but are behind the camera.
 
     The density of a Gaussian along a line is that of another one, whose mean the precision has.
     """
-    gaussians, camera = case.scene
     focal = np.array([camera.fx, camera.fy])
     axes = camera.rotation @ reference.quat_to_rotation(gaussians.quats)
     axes = axes * np.exp(gaussians.log_scales)[:, None, :]
@@ -151,7 +141,7 @@ def composited_along_parallel_rays(case, low_pass=0.3) -> tuple[np.ndarray, int]
     means = (gaussians.means - camera.center) @ camera.rotation.T
     colors = np.maximum(gaussians.sh0[:, 0] * reference.C_00 + 0.5, 0)
     planes, behind = [], 0
-    for y, x in np.ndindex(case.height, case.width):
+    for y, x in np.ndindex(camera.height, camera.width):
         point = (np.array([x, y]) + 0.5 - [camera.cx, camera.cy]) / focal
         beside = point - means[:, :2]
         along = -np.einsum("nk,nk->n", precision[:, 2, :2], beside) / precision[:, 2, 2]
@@ -174,22 +164,20 @@ def composited_along_parallel_rays(case, low_pass=0.3) -> tuple[np.ndarray, int]
 @pytest.mark.parametrize("projection", ["ewa", "unscented"])
 def test_pixel_order_along_parallel_rays_matches_the_reference(projection):
     """Needles and discs in all directions that cross: some peaks are behind the camera."""
-    case = LensCase("needles", 19, 14, 0, 12, lens=LENSES["orthographic"], recipe=needles)
+    lens, rng = LENSES["orthographic"], np.random.default_rng(0)
+    camera = camera_behind(lens, width=19, height=14)
+    film = rng.uniform(0.3, 0.7, (12, 2)) * [camera.width, camera.height]
+    points = points_at(lens, camera, film, rng.uniform(0.3, 0.6, 12))
+    sizes, logits = rng.uniform(0.3, 4.0, (12, 3)), rng.uniform(-1.5, 0.5, 12)
+    gaussians = gaussians_at_points(lens, rng, camera, points, sizes, logits, degree=0)
+    device, device_camera = device_gaussians(gaussians, FLOAT64), lens_camera(camera, lens, FLOAT64)
     window = Approximations(projection=projection, order="pixel", order_window=12)
-    _, frame = case.render(FLOAT64, pipeline_of(window, 0))
-    expected, behind = composited_along_parallel_rays(case)
+    ordered, plain = (
+        planes_of(rendering.render(device, device_camera, pipeline_of(approximations, 0)))
+        for approximations in (window, Approximations(projection=projection))
+    )
+    expected, behind = composited_along_parallel_rays(gaussians, camera)
     assert behind > 20
     # A dozen products and sums in double precision.
-    np.testing.assert_allclose(planes_of(frame), expected, rtol=0, atol=1e-12)
-    _, plain = case.render(FLOAT64, pipeline_of(Approximations(projection=projection), 0))
-    assert np.abs(planes_of(plain) - expected).max() > 0.05
-
-
-def needles(case, rng):
-    camera = camera_behind(case, rng)
-    size = np.array([case.width, case.height])
-    film = rng.uniform(0.3, 0.7, (case.count, 2)) * size
-    points = points_at(case.lens, camera, film, rng.uniform(0.3, 0.6, case.count))
-    sizes = rng.uniform(0.3, 4.0, (case.count, 3))
-    logits = rng.uniform(-1.5, 0.5, case.count)
-    return gaussians_at_points(case, rng, camera, points, sizes, logits), camera
+    np.testing.assert_allclose(ordered, expected, rtol=0, atol=1e-12)
+    assert np.abs(plain - expected).max() > 0.05

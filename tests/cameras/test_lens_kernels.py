@@ -4,36 +4,19 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 
-import drjit as dr
 import numpy as np
 import pytest
-from support.helpers import (
-    FLOAT32,
-    FLOAT64,
-    Cotangents,
-    clear,
-    device_gaussians,
-    frame_adjoint,
-    frame_tangent,
-    plane_cotangents,
-    render_composed,
-    rows,
-)
-from support.kernels import drain_kernels
-from support.lens_scenes import FORMS, LENSES, LensCase, case_of, kernel_lens
+from support.cases import with_lens
+from support.helpers import FLOAT32, FLOAT64, Case
+from support.kernels import kernels_of_a_frame
+from support.lens_scenes import FORMS, LENSES, kernel_lens, lens_camera
 
-from drgs.accuracy.pipeline import pipeline_of
-from drgs.accuracy.unscented import unscented_shape
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
-from drgs.config.approximations import Approximations
-from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import effects
 from drgs.reference.effects import OpenCV
 from drgs.reference.effects import ThinPrismFisheye as ThinPrism
-from drgs.splatting import rendering
-from drgs.splatting.projection import ewa
 
 # ----------------------------------------------------------------------------------------------
 # Missing coefficients
@@ -106,42 +89,11 @@ def test_valid_region_matches_the_reference(lens, is_limited_by_tilt):
         assert (limit < 0.99 * getattr(radial, name)) == is_limited_by_tilt
 
 
-def kernels_of(lens, camera_seed=0) -> dict[str, list]:
+def kernels_behind(lens) -> dict[str, list]:
     """[hash, operation count] of the kernels of a frame, its adjoint, and its tangent."""
     # Few enough entries that Dr.Jit's running maximum needs one pass.
-    case = LensCase("kernels", 37, 29, 1, 20, seed=camera_seed, lens=lens)
-    gaussians, camera = device_gaussians(case.gaussians, FLOAT32), case.device_camera(FLOAT32)
-    # Aligned as Dr.Jit's own memory: see test_composition.
-    flat = gaussians.logit_opacities + dr.opaque(FLOAT32.Float, 0)
-    gaussians = replace(gaussians, logit_opacities=flat)
-    ones = dr.opaque(FLOAT32.Float, 1, case.width * case.height)
-    dr.eval(gaussians, ones)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history()
-        # The pipeline of the other tests, for the same kernels.
-        frame = rendering.render(gaussians, camera, case.pipeline)
-        dr.eval(frame.planes())
-        forward = drain_kernels()
-        frame_adjoint(gaussians, frame, [ones] * (len(frame.planes()) - 1), ones)
-        adjoint = drain_kernels()
-        dr.eval(frame_tangent(gaussians, frame, gaussians))
-        tangent = drain_kernels()
-    return {"forward": forward, "adjoint": adjoint, "tangent": tangent}
-
-
-@pytest.mark.parametrize(
-    ("lens", "other"),
-    [
-        (LENSES["rational"], OpenCV(0.1, 0.02, -0.01, 0.02, 0.01, 0.003, -0.002, 0.001)),
-        (LENSES["thin prism"], ThinPrism(*(0.01 * k for k in range(1, 9)))),
-    ],
-    ids=["rational", "thin prism"],
-)
-def test_kernels_do_not_depend_on_the_numbers_of_a_lens(lens, other):
-    """Otherwise each camera, and each step of a calibration, would compile its own."""
-    kernels = kernels_of(lens)
-    assert kernels == kernels_of(other, camera_seed=5)
-    assert all(len(entries) >= 3 for entries in kernels.values())
+    case = Case("kernels", 37, 29, 1, 20)
+    return kernels_of_a_frame(case.pipeline, case, lens_camera(case.camera, lens, FLOAT32))
 
 
 @pytest.mark.parametrize(
@@ -153,7 +105,7 @@ def test_kernels_do_not_depend_on_the_numbers_of_a_lens(lens, other):
     ids=["slopes", "angles"],
 )
 def test_coefficients_add_operations_to_the_projection_only(lenses):
-    for fewer, more in pairwise(kernels_of(lens) for lens in lenses):
+    for fewer, more in pairwise(kernels_behind(lens) for lens in lenses):
         for name, entries in fewer.items():
             before, after = (sum(count for _, count in each) for each in (entries, more[name]))
             assert before < after, name
@@ -168,45 +120,35 @@ def test_coefficients_add_operations_to_the_projection_only(lenses):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "shape", "precision", "defocus"),
+    ("name", "projection", "precision", "aperture"),
     [
-        *((name, ewa, FLOAT32, None) for name in FORMS),
-        ("rational", ewa, FLOAT64, None),
-        ("rational", unscented_shape, FLOAT32, None),
-        ("fisheye", unscented_shape, FLOAT32, None),
-        ("rational", ewa, FLOAT32, effects.ThinLens(0.21875, 2.0)),
-        ("rational", ewa, FLOAT64, effects.ThinLens(0.21875, 2.0)),
+        *((name, "ewa", FLOAT32, None) for name in FORMS),
+        ("rational", "ewa", FLOAT64, None),
+        ("rational", "unscented", FLOAT32, None),
+        ("fisheye", "unscented", FLOAT32, None),
+        ("rational", "ewa", FLOAT32, (0.21875, 2.0)),
+        ("rational", "ewa", FLOAT64, (0.21875, 2.0)),
     ],
-    ids=lambda value: value if isinstance(value, str) else getattr(value, "__name__", None),
+    ids=lambda value: value if isinstance(value, str) else None,
 )
-def test_invisible_positions_affect_no_other_gaussian(precision, name, shape, defocus):
+def test_invisible_positions_affect_no_other_gaussian(precision, name, projection, aperture):
     """The image and all other gradients are those of the same Gaussians far away."""
-    case = clear(case_of(name, count=30, defocus=defocus))
-    means = case.gaussians.means.copy()
+    given = {"approximations": {"projection": projection}, "aperture": aperture}
+    case = with_lens(name, count=30, **given)
+    rotation, center = case.pose
     bad = np.array([
         [np.nan, 0, 0], [0, np.nan, 0], [0, 0, np.nan], [np.inf, 0, 0], [0, -np.inf, 0],
         [0, 0, np.inf], [0, 0, -np.inf], [np.inf, np.inf, np.inf], [-np.inf, np.nan, np.inf],
-        case.camera.center, case.camera.center - 20 * case.camera.rotation[2],
+        center, center - 20 * rotation[2],
     ])  # fmt: skip
     where = np.arange(10, 10 + len(bad))
-    means[where] = bad
-    hidden = case.gaussians.logit_opacities.copy()
-    hidden[where] = -50.0
-    pipeline = replace(case.pipeline, shape=shape)
-    cotangents = Cotangents.random(case)
-    d_features, d_transmittance = plane_cotangents(case, cotangents, precision)
-
-    def rendered(gaussians):
-        device = device_gaussians(gaussians, precision)
-        frame = render_composed(device, case.device_camera(precision), pipeline)
-        gradients = frame_adjoint(device, frame, d_features, d_transmittance).parameters
-        planes = {n: rows(plane) for n, plane in enumerate(frame.planes())}
-        return planes, {n: np.array(getattr(gradients, n)) for n in PARAMETER_NAMES}
-
-    planes, gradients = rendered(replace(case.gaussians, means=means))
-    expected_planes, expected = rendered(replace(case.gaussians, logit_opacities=hidden))
-    for n, plane in expected_planes.items():
-        np.testing.assert_array_equal(planes[n], plane)
+    means, hidden = case.values["means"].copy(), case.values["logit_opacities"].copy()
+    means[where], hidden[where] = bad, -50.0
+    weights = np.random.default_rng(1).normal(size=(5, case.width * case.height))
+    values = {**case.values, "means": means}, {**case.values, "logit_opacities": hidden}
+    planes, expected_planes = (case.planes(v, precision.Float) for v in values)
+    np.testing.assert_array_equal(planes, expected_planes)
+    gradients, expected = (case.gradients(v, weights, precision.Float) for v in values)
     for n, gradient in expected.items():
         assert not gradients[n][where].any()
         np.testing.assert_array_equal(gradients[n], gradient)
@@ -215,8 +157,8 @@ def test_invisible_positions_affect_no_other_gaussian(precision, name, shape, de
 
 @pytest.mark.parametrize("name", ["rational", "orthographic"])
 def test_exact_projection_refuses_lenses_other_than_pinholes(name):
-    case = LensCase("tiny", 13, 11, 0, 5, lens=LENSES[name])
-    kind = type(kernel_lens(LENSES[name])).__name__
+    case = with_lens(name, approximations={"projection": "exact"}, count=5)
+    kind = type(case.lens).__name__
     message = f"^splats: projection 'exact' needs a pinhole, got {kind}"
     with pytest.raises(ValueError, match=message):
-        case.render(FLOAT32, pipeline_of(Approximations(projection="exact"), 0))
+        case.planes(case.values)

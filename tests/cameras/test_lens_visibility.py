@@ -4,17 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.helpers import (
-    FLOAT32,
-    FLOAT64,
-    both_precisions,
-    rows,
-    single,
-)
+from support.helpers import FLOAT32, FLOAT64, both_precisions, rows, single
 from support.lens_scenes import (
     LENSES,
     camera_behind,
-    case_of,
     covariances,
     every_lens,
     kernel_lens,
@@ -147,7 +140,7 @@ def with_border_at(part) -> tuple[effects.Lens, reference.Camera]:
 
 BORDERS = {
     **{
-        name: (lens, camera_behind(case_of(name), np.random.default_rng(0)))
+        name: (lens, camera_behind(lens))
         for name, lens in LENSES.items()
         if isinstance(lens, OpenCV)
     },
@@ -205,7 +198,7 @@ def rays_of(camera, lens, film, precision) -> np.ndarray:
 @every_lens
 def test_points_of_a_ray_project_to_its_pixel(precision, name):
     """The reference projects points of rays, wherever the lens shows anything."""
-    lens, camera = LENSES[name], camera_behind(case_of(name), np.random.default_rng(0))
+    lens, camera = LENSES[name], camera_behind(LENSES[name])
     y, x = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
     film = np.column_stack([x, y])
     film = np.vstack([film, [[camera.cx, camera.cy]]])

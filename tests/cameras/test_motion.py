@@ -6,44 +6,35 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.helpers import (
-    FLOAT32,
-    FLOAT64,
-    Cotangents,
-    assert_images_agree,
-    both_precisions,
-    clear,
-    device_gaussians,
-    frame_adjoint,
-    image_planes,
-    plane_cotangents,
-    rows,
-)
-from support.lens_scenes import IMAGE, LENSES, lens_camera, planes_of
-from support.motion_checks import MovingCase, time_of
+from scipy.spatial.transform import Rotation
+from support.cases import close_camera, reference_camera, shutter, with_lens
+from support.helpers import FLOAT32, FLOAT64, both_precisions, device_camera, device_gaussians, rows
+from support.lens_scenes import lens_camera, planes_of
 
-from drgs.cameras.camera import cameras_in_time
 from drgs.cameras.motion import Motion, MotionBlur, RollingShutter
-from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import effects
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
+from drgs.testing import Case
 
-KINDS = {name: LENSES.get(name, effects.Pinhole()) for name in ("pinhole", "rational", "fisheye")}
+SHUTTERS = {0: (RollingShutter,), 2: (MotionBlur, 2), 4: (MotionBlur, 4)}
+"""Type and further arguments, by the number of samples; 0 of a rolling shutter."""
 
-
-def case_of(name, **others) -> MovingCase:
-    return MovingCase(name, 37, 29, 1, 20, lens=KINDS[name], **others)
+AXIS, DIRECTION = np.array([0.6, 0.48, -0.64]), np.array([0.36, -0.8, 0.48])
 
 
 @both_precisions
-@pytest.mark.parametrize("turn", [0.0, 1e-5, 0.06, 2.5])
-def test_poses_match_the_reference(precision, turn):
-    case = case_of("pinhole", turn=turn, travel=3.0)
-    camera = case.device_camera(precision)
+@pytest.mark.parametrize("angle", [0.0, 1e-5, 0.06, 2.5])
+def test_poses_match_the_reference(precision, angle):
+    camera = reference_camera(Case("pose"))
+    # A rotation to more than single precision: turns are products of rotations.
+    camera = replace(camera, rotation=Rotation.from_matrix(camera.rotation).as_matrix())
+    close = close_camera(camera, 3 * DIRECTION, angle * AXIS)
+    device, end = (device_camera(each, precision) for each in (camera, close))
+    motion = Motion(*Motion.relative_motion(device, end.rotation, end.center))
     for time in (0.0, 0.25, 1.0):
-        actual = camera.shutter.pose(camera, precision.Float(time))
-        expected = case.camera_at(time)
+        actual = motion.pose(device, precision.Float(time))
+        expected = effects.camera_at(camera, close, time)
         # Products of some ten roundings; the turn's axis is found by its sine.
         tolerance = {FLOAT64: 1e-14, FLOAT32: 2e-6}[precision]
         rotation = np.array(actual.rotation).astype(np.float64)[..., 0]
@@ -56,33 +47,11 @@ def test_poses_match_the_reference(precision, turn):
 @pytest.mark.parametrize("samples", [0, 4])
 def test_static_camera_renders_the_plain_image(precision, samples):
     """To the last bit: turns of zero are the identity."""
-    case = clear(case_of("pinhole", samples=samples))
-    zero = precision.Array3f(0, 0, 0)
-    camera = lens_camera(case.camera, case.lens, precision)
-    moving = RollingShutter(zero, zero) if samples == 0 else MotionBlur(zero, zero, samples)
-    gaussians = device_gaussians(case.gaussians, precision)
-    plain = planes_of(rendering.render(gaussians, camera, case.pipeline))
-    cameras = cameras_in_time(replace(camera, shutter=moving))
-    assert len(cameras) == max(samples, 1)
-    for at_time in cameras:
-        planes = planes_of(rendering.render(gaussians, at_time, case.pipeline))
-        np.testing.assert_array_equal(planes, plain)
-
-
-@pytest.mark.slow
-@both_precisions
-@pytest.mark.parametrize(
-    ("name", "turn"), [("pinhole", 0.06), ("pinhole", 0.3), ("rational", 0.06), ("fisheye", 0.1)]
-)
-def test_rolling_shutter_matches_splats_at_the_time_of_their_row(precision, name, turn):
-    """Found by bisection and secants in the reference. Some are never read: above, or below."""
-    case = clear(case_of(name, samples=0, turn=turn))
-    times = np.array([time_of(case, mean) for mean in case.gaussians.means])
-    assert (times == 0).any() and (times == 1).any() and ((times > 0) & (times < 1)).sum() >= 8
-    _, (frame,) = case.frames(precision)
-    assert_images_agree(image_planes(frame, case), case.rendered, IMAGE[precision])
-    still = effects.render(*case.scene, case.lens, case.background)
-    assert np.abs(case.rendered.image - still.image).max() > 0.02
+    plain, still = Case("plain"), np.zeros(3)
+    moving = replace(plain, shutter=shutter(*SHUTTERS[samples], travel=still, turn=still))
+    assert len(moving.frames(plain.values)[1]) == max(samples, 1)
+    images = (case.planes(plain.values, precision.Float) for case in (moving, plain))
+    np.testing.assert_array_equal(*images)
 
 
 def test_horizontal_motion_is_exact_at_row_centers():
@@ -112,19 +81,16 @@ def test_horizontal_motion_is_exact_at_row_centers():
 
 
 @pytest.mark.parametrize("samples", [2, 0], ids=["motion blur", "rolling"])
-@pytest.mark.parametrize(("turn", "travel"), [(0.5, 2.0), (2.5, 50.0), (3.0, 1e5)])
+@pytest.mark.parametrize(("angle", "distance"), [(0.5, 2.0), (2.5, 50.0), (3.0, 1e5)])
 @pytest.mark.parametrize("name", ["pinhole", "fisheye"])
-def test_fast_camera_motion_stays_finite(samples, turn, travel, name):
+def test_fast_camera_motion_stays_finite(samples, angle, distance, name):
     """Past the splats, through them, away from them; and positions that are no numbers."""
-    case = case_of(name, samples=samples, turn=turn, travel=travel)
-    means = case.gaussians.means.copy()
+    motion = {"travel": distance * DIRECTION, "turn": angle * AXIS}
+    case = with_lens(name, shutter=shutter(*SHUTTERS[samples], **motion), count=20)
+    means = case.values["means"].copy()
     means[-3:] = [[np.nan, 0, 0], [0, np.inf, 0], [-np.inf, np.nan, np.inf]]
-    cotangents = Cotangents.random(replace(case, samples=0, turn=0.0, travel=0.0))
-    d_features, d_transmittance = plane_cotangents(case, cotangents, FLOAT32)
-    gaussians, frames = case.frames(FLOAT32, gaussians=replace(case.gaussians, means=means))
-    for frame in frames:
-        assert np.isfinite(planes_of(frame)).all()
-        gradients = frame_adjoint(gaussians, frame, d_features, d_transmittance)
-        for parameter in PARAMETER_NAMES:
-            values = np.array(getattr(gradients.parameters, parameter))
-            assert np.isfinite(values).all() and not values[-3:].any(), parameter
+    values = {**case.values, "means": means}
+    weights = np.random.default_rng(1).normal(size=(5, case.width * case.height))
+    assert np.isfinite(case.planes(values, FLOAT32.Float)).all()
+    for parameter, gradient in case.gradients(values, weights, FLOAT32.Float).items():
+        assert np.isfinite(gradient).all() and not gradient[-3:].any(), parameter

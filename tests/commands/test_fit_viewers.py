@@ -23,8 +23,7 @@ from support.fit_command import (
 )
 from support.folders import contents
 from support.render_command import run as render
-from support.small_capture import HEIGHT, WIDTH, decibels, pose_around
-from support.small_fits import double, photograph
+from support.small_capture import HEIGHT, WIDTH, decibels, double, photograph, pose_around
 
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset

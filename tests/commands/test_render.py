@@ -15,14 +15,7 @@ from support import small_capture
 from support.commands import assert_ends_well
 from support.folders import visible
 from support.openexr import read_exr
-from support.render_command import (
-    EIGHT_BITS,
-    assert_shows,
-    rendered,
-    run,
-    sensor,
-    write_scene,
-)
+from support.render_command import EIGHT_BITS, assert_shows, rendered, run, sensor, write_scene
 from support.small_capture import (
     FIELD_OF_VIEW,
     FOCUS,

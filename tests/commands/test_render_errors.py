@@ -9,13 +9,7 @@ from PIL import Image
 from support.commands import assert_ends_well, assert_refused
 from support.folders import visible
 from support.render_command import sensor, write_scene
-from support.small_capture import (
-    HEIGHT,
-    WIDTH,
-    make_dataset,
-    pose_around,
-    write_fit,
-)
+from support.small_capture import HEIGHT, WIDTH, make_dataset, pose_around, write_fit
 
 from drgs.core import memory
 from drgs.core.folders import sole_writer

@@ -1,9 +1,12 @@
 """Rows, packets, and numbers that come from the host."""
 
+from functools import partial
+
 import drjit as dr
 import numpy as np
 import pytest
 from support.helpers import both_precisions
+from support.kernels import kernel_hashes
 
 from drgs.core import arrays
 
@@ -55,10 +58,8 @@ def test_alignment_of_numpy_arrays_does_not_affect_kernels():
     hashes = set()
     for offset in range(8):
         values = np.arange(64, dtype=np.float32)[offset : offset + 40]
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            dr.eval(arrays.from_host(dr.llvm.ad.Float, values) * 1.25 + 0.5)
-            hashes |= {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
+        result = arrays.from_host(dr.llvm.ad.Float, values) * 1.25 + 0.5
+        hashes |= kernel_hashes(partial(dr.eval, result))
     assert len(hashes) == 1
 
 

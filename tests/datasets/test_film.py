@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.datasets import view_at
 from support.lens_scenes import LENSES, PINHOLE, kernel_lens
-from support.small_fits import reference_camera
+from support.small_capture import reference_camera
 
 from drgs.datasets.film import to_camera, to_film
 

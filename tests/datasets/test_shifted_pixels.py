@@ -11,12 +11,7 @@ from support.datasets import edit, load, view_at
 
 from drgs.config.schema import DataConfig
 from drgs.datasets import load_dataset
-from drgs.datasets.images import (
-    compact_photograph,
-    shift_pixels,
-    smaller_view,
-    without_images,
-)
+from drgs.datasets.images import compact_photograph, shift_pixels, smaller_view, without_images
 from drgs.io.images import to_uint8
 
 

@@ -7,8 +7,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 from support.datasets import dataset_of, view_at, write_points
 from support.lens_scenes import LENSES, PINHOLE, kernel_lens, points_at
-from support.small_capture import make_dataset, write_dataset
-from support.small_fits import reference_camera
+from support.small_capture import make_dataset, reference_camera, write_dataset
 
 from drgs.cameras.viewpoints import CameraMotion
 from drgs.config.load import config_from

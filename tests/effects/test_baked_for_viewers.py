@@ -5,8 +5,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.small_capture import blobs, make_dataset
-from support.small_fits import double, reference_camera
+from support.small_capture import blobs, double, make_dataset, reference_camera
 
 from drgs.config.approximations import Approximations
 from drgs.effects.smoothing import MIN_VARIANCE_SHARE, bake_for_viewers

@@ -12,7 +12,7 @@ from drgs.effects.compose import with_effects, without_effects
 from drgs.effects.defocus import Defocused, DimmedFalloff
 from drgs.effects.smoothing import apply_smoothing
 from drgs.splatting import rendering
-from drgs.splatting.footprint import FootprintModel
+from drgs.splatting.footprint import ImageModel
 
 CASE = Case("compose", 16, 12, 0, count=12)
 APERTURE = Aperture(llvm.Float(0.1), llvm.Float(2.0))
@@ -31,7 +31,7 @@ def test_unused_effect_leaves_pipeline_unchanged(scene):
 
 def test_aperture_wraps_projection_and_falloff(scene):
     gaussians, camera = scene
-    pipeline = rendering.Pipeline(0, shape=exact_shape, model=FootprintModel(falloff=RayFalloff()))
+    pipeline = rendering.Pipeline(0, shape=exact_shape, model=ImageModel(falloff=RayFalloff()))
     found = with_effects(pipeline, gaussians, replace(camera, aperture=APERTURE))
     assert found.shape == Defocused(exact_shape)
     assert found.model.falloff == DimmedFalloff(RayFalloff())

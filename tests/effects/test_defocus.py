@@ -12,13 +12,12 @@ from support.helpers import (
     FLOAT32,
     FLOAT64,
     both_precisions,
-    clear,
     device_gaussians,
     render_composed,
     rows,
     single,
 )
-from support.lens_scenes import PINHOLE, LensCase, covariances, lens_camera, planes_of
+from support.lens_scenes import PINHOLE, covariances, lens_camera, planes_of
 from support.reference_lenses import camera_at_origin, gaussians_at
 
 from drgs.accuracy.pipeline import pipeline_of
@@ -30,6 +29,7 @@ from drgs.reference import splatting as reference
 from drgs.reference.effects import ThinLens
 from drgs.splatting import rendering
 from drgs.splatting.projection import compensated_opacity, ewa, load_rows, plain_opacity, project
+from drgs.testing import Case
 
 # Blurred by up to 3 px: f a |1 / focus - 1 / z| with f = 26 px and z from 1 to 4.
 DEFOCUS = ThinLens(0.21875, 2.0)
@@ -45,7 +45,7 @@ def aperture_camera(camera, precision, defocus):
 
 
 def splats_of(gaussians, camera, precision, defocus, rule=plain_opacity, low_pass=0.3):
-    """Projected by the kernels, in focus if ``defocus`` is None."""
+    """DirectProjection by the kernels, in focus if ``defocus`` is None."""
     device = aperture_camera(camera, precision, defocus)
     shape = ewa if defocus is None else Defocused(ewa)
     parameter_rows = load_rows(device_gaussians(gaussians, precision), 0)
@@ -54,11 +54,10 @@ def splats_of(gaussians, camera, precision, defocus, rule=plain_opacity, low_pas
 
 @both_precisions
 def test_zero_aperture_renders_the_pinhole_image(precision):
-    case = clear(LensCase("defocus", 37, 29, 1, defocus=ThinLens(0.0, 2.0)))
-    gaussians, frame = case.render(precision)
-    in_focus = render_composed(gaussians, replace(frame.camera, aperture=None), case.pipeline)
+    case = Case("defocus", aperture=(0.0, 2.0))
+    in_focus = replace(case, aperture=None).planes(case.values, precision.Float)
     # The same covariance; the factor of the opacity is x / x.
-    np.testing.assert_array_equal(planes_of(frame), planes_of(in_focus))
+    np.testing.assert_array_equal(case.planes(case.values, precision.Float), in_focus)
 
 
 @both_precisions

@@ -14,6 +14,7 @@ from support.helpers import (
     clear,
     device_camera,
     device_gaussians,
+    host_gaussians,
     image_planes,
     render_composed,
     rows,
@@ -104,7 +105,7 @@ def test_baked_gaussians_give_the_same_image(precision):
         smoothed_reference(case.gaussians, smoothing), case.camera, case.background
     )
     plain = bake_smoothing(
-        replace(as_numpy(case.gaussians), smoothing=smoothing.astype(np.float32))
+        replace(host_gaussians(case.gaussians), smoothing=smoothing.astype(np.float32))
     )
     assert plain.smoothing is None and plain.log_scales.dtype == np.float32
     again = bake_smoothing(plain)  # which has no filter
@@ -121,7 +122,7 @@ def test_baked_gaussians_give_the_same_image(precision):
 
 @pytest.mark.parametrize(("logit", "smoothing"), [(40.0, 1e-6), (-80.0, 10.0)])
 def test_baked_opacities_stay_finite_where_they_round_to_0_or_1(logit, smoothing):
-    host = as_numpy(Case("", 20, 20, 0, count=2).gaussians)
+    host = host_gaussians(Case("", 20, 20, 0, count=2).gaussians)
     host = replace(
         host,
         logit_opacities=np.full(2, logit, np.float32),
@@ -132,18 +133,13 @@ def test_baked_opacities_stay_finite_where_they_round_to_0_or_1(logit, smoothing
     assert ((plain.logit_opacities > 10) == (logit > 0)).all()
 
 
-def as_numpy(gaussians: reference.Gaussians) -> Gaussians:
-    """In single precision, as files hold them."""
-    return Gaussians(**{n: getattr(gaussians, n).astype(np.float32) for n in PARAMETER_NAMES})
-
-
 # ----------------------------------------------------------------------------------------------
 # Files
 # ----------------------------------------------------------------------------------------------
 
 
 def with_filter(count=12, degree=1) -> Gaussians:
-    host = as_numpy(Case("", 20, 20, degree, count=count).gaussians)
+    host = host_gaussians(Case("", 20, 20, degree, count=count).gaussians)
     return replace(host, smoothing=filter_of(count).astype(np.float32))
 
 
@@ -200,7 +196,7 @@ def loaded_with(scene, **settings):
 
 def test_the_plugin_uses_the_filter_of_a_file_unless_it_is_ignored(tmp_path):
     scene = Scene()
-    plain = as_numpy(scene.gaussians)
+    plain = host_gaussians(scene.gaussians)
     plain.save(tmp_path / "plain.ply")
     filtered = replace(plain, smoothing=scene_filter(scene))
     filtered.save(tmp_path / "filtered.ply")

@@ -9,12 +9,7 @@ from scipy.spatial.transform import Rotation
 from support.formats import gaussians_within_ranges
 
 from drgs.export.merging import take
-from drgs.export.voxels import (
-    FLOATERS,
-    VoxelRule,
-    find_cluster,
-    find_non_floaters,
-)
+from drgs.export.voxels import FLOATERS, VoxelRule, find_cluster, find_non_floaters
 from drgs.gaussians.parameters import Gaussians
 
 

@@ -6,13 +6,12 @@ import io
 import os
 import re
 import shlex
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
 
 import pytest
-from conftest import REPOSITORY
+from conftest import REPOSITORY, run_program
 
 import drgs
 from drgs.bench import __main__ as bench
@@ -98,7 +97,7 @@ def test_readme_leads_to_every_page():
 # ----------------------------------------------------------------------------------------------
 
 
-FOLDERS = ("drgs", "plugins", "scenes", "tests", "docs")
+FOLDERS = ("drgs", "plugins", "scenes", "examples", "tests", "docs")
 
 
 @each_page
@@ -211,10 +210,10 @@ def test_documents_show_every_command():
 # ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("example", sorted((REPOSITORY / "tests" / "examples").glob("*.py")))
+@pytest.mark.parametrize("example", sorted((REPOSITORY / "examples").glob("*.py")))
 def test_documents_contain_the_examples_of_extensions(example):
     program, page = example.read_text(), text_of("docs/developing.md")
-    included = f"```{{literalinclude}} ../tests/examples/{example.name}\n```"
+    included = f"```{{literalinclude}} ../examples/{example.name}\n```"
     assert f"```python\n{program}```" in page or included in page
     assert 20 <= len(program.splitlines()) <= 60
 
@@ -223,11 +222,5 @@ def test_documents_contain_the_examples_of_extensions(example):
 def test_programs_in_the_documents_run():
     """Run by sybil: see ``support.pages``."""
     options = ["-q", "-n0", "-m", "", "-psupport.pages", "-pno:cacheprovider"]
-    result = subprocess.run(
-        [sys.executable, "-m", "pytest", *options, "README.md", "docs"],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-    )
-    assert result.returncode == 0, result.stdout
-    assert int(re.search(r"(\d+) passed", result.stdout)[1]) >= 28
+    shown = run_program(sys.executable, "-m", "pytest", *options, "README.md", "docs")
+    assert int(re.search(r"(\d+) passed", shown)[1]) >= 28

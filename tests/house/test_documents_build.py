@@ -1,10 +1,9 @@
 """Sphinx builds the pages, and finds the targets of the links of all pages, without a warning."""
 
-import subprocess
 import sys
 
 import pytest
-from conftest import REPOSITORY
+from conftest import REPOSITORY, run_program
 
 pytestmark = pytest.mark.slow
 
@@ -22,13 +21,7 @@ def test_sphinx_builds_the_pages_without_a_warning(folder, settings, tmp_path):
         pytest.importorskip(module)
     command = ["-W", "--keep-going", "-b", "html", "-c", "docs", "-d", str(tmp_path / "trees")]
     command += [f"-D{name}={value}" for name, value in settings.items()]
-    result = subprocess.run(
-        [sys.executable, "-m", "sphinx", *command, folder, str(tmp_path / "html")],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-    )
-    assert result.returncode == 0, result.stderr
+    run_program(sys.executable, "-m", "sphinx", *command, folder, tmp_path / "html")
     for page in (REPOSITORY / "docs").rglob("*.md"):
         built = tmp_path / "html" / page.relative_to(REPOSITORY / folder)
         assert "_build" in page.parts or built.with_suffix(".html").exists(), page

@@ -9,7 +9,7 @@ from conftest import REPOSITORY
 from drgs.config.schema import FitConfig
 from drgs.core import constants, memory
 from drgs.datasets import transforms
-from drgs.integrator import checks
+from drgs.integrator import image_render
 from drgs.io import images
 from drgs.reference import splatting
 from drgs.render import __main__ as render
@@ -82,7 +82,7 @@ def test_documented_limits_match_the_code():
     stated = {
         "a photograph": images.MAX_PIXELS,
         "a rendered image": memory.IMAGE_BYTES,
-        "samples of a pixel": checks.MAX_SAMPLES,
+        "samples of a pixel": image_render.MAX_SAMPLES,
         "AOVs": constants.MAX_FEATURES,
         "Gaussians": largest,
         "frames of an orbit": render.MAX_FRAMES,

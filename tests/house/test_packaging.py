@@ -4,27 +4,15 @@ The build backend alone makes what is installed: offline, and without pip.
 """
 
 import importlib.util
-import shutil
-import subprocess
 import sys
 import zipfile
 
 import pytest
-from conftest import REPOSITORY
+from conftest import REPOSITORY, copy_checkout, run_program
 
 PRINT_PLUGINS_PATH = (
     "import drgs, drgs.plugins, drgs.io, drgs.datasets; print(drgs.plugins.__file__)"
 )
-
-
-def copy_checkout(folder):
-    for name in ("drgs", "plugins"):
-        shutil.copytree(
-            REPOSITORY / name, folder / name, ignore=shutil.ignore_patterns("__pycache__")
-        )
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(REPOSITORY / name, folder / name)
-    return folder
 
 
 def site_packages(checkout, folder, hook):
@@ -32,10 +20,7 @@ def site_packages(checkout, folder, hook):
     if importlib.util.find_spec("hatchling") is None:
         pytest.skip("hatchling is not installed")
     program = f"from hatchling import build; build.{hook}({str(folder)!r})"
-    result = subprocess.run(
-        [sys.executable, "-c", program], cwd=checkout, capture_output=True, text=True
-    )
-    assert result.returncode == 0, result.stderr
+    run_program(sys.executable, "-c", program, cwd=checkout)
     (wheel,) = folder.glob("*.whl")
     with zipfile.ZipFile(wheel) as file:
         file.extractall(folder)
@@ -46,9 +31,8 @@ def site_packages(checkout, folder, hook):
 @pytest.fixture
 def installed(tmp_path):
     """A folder that holds what an installation puts into site-packages."""
-    checkout = tmp_path / "checkout"
-    checkout.mkdir()
-    return site_packages(copy_checkout(checkout), tmp_path / "installed", "build_wheel")
+    checkout = copy_checkout(tmp_path / "checkout")
+    return site_packages(checkout, tmp_path / "installed", "build_wheel")
 
 
 def test_every_file_is_installed_and_the_plugins_are_found(run_python, tmp_path, installed):
@@ -76,9 +60,8 @@ def test_checkout_finds_its_plugins(run_python, tmp_path, installed):
 @pytest.mark.slow
 def test_an_editable_install_wins_over_a_clone_of_the_same_name(tmp_path):
     """In the clone's parent folder, where the folder ``drgs`` could be a namespace package."""
-    checkout = tmp_path / "drgs"
-    checkout.mkdir()
-    site = site_packages(copy_checkout(checkout), tmp_path / "site", "build_editable")
+    checkout = copy_checkout(tmp_path / "drgs")
+    site = site_packages(checkout, tmp_path / "site", "build_editable")
     # -S leaves out this environment's .pth files, such as that of an editable drgs.
     dependencies = [path for path in sys.path if path.endswith("site-packages")]
     program = (
@@ -88,10 +71,8 @@ def test_an_editable_install_wins_over_a_clone_of_the_same_name(tmp_path):
         "import drgs.plugins; print(drgs.plugins.__file__)\n"
         "print(type(mi.load_dict({'type': 'splats'})).__name__)"
     )
-    result = subprocess.run(
-        [sys.executable, "-S", "-c", program], cwd=tmp_path, capture_output=True, text=True
-    )
-    package, plugins, integrator = result.stdout.splitlines() or [result.stderr] * 3
+    shown = run_program(sys.executable, "-S", "-c", program, cwd=tmp_path)
+    package, plugins, integrator = shown.splitlines()
     assert package == str(checkout / "drgs" / "__init__.py")
     assert plugins == str(checkout / "plugins" / "__init__.py")
     assert integrator == "SplatsIntegrator"

@@ -2,14 +2,14 @@
 
 import ast
 import re
-import subprocess
 import sys
 from contextlib import nullcontext
 
 import drjit as dr
 import numpy as np
-from conftest import REPOSITORY
+from conftest import REPOSITORY, run_program
 from drjit.llvm.ad import Float, UInt32
+from support.kernels import launched
 
 from drgs.core import private
 
@@ -80,10 +80,7 @@ def test_llvm_version_is_known():
 
 def vector_width() -> int:
     """Read the number of 32-bit numbers in a vector from the code that Dr.Jit generates."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        dr.eval(dr.arange(Float, 64) * dr.opaque(Float, 2))
-        (kernel,) = dr.kernel_history([dr.KernelType.JIT])
+    (kernel,) = launched(lambda: dr.eval(dr.arange(Float, 64) * dr.opaque(Float, 2)))
     return int(re.search(r"<(\d+) x float>", kernel["ir"].getvalue())[1])
 
 
@@ -105,8 +102,7 @@ print("<8 x float>" in ir, "+avx512" in ir, "+avx2" in ir)
 
 def test_avx512_can_be_disabled():
     """In a process of its own, since there is no way back."""
-    run = [sys.executable, "-c", PROGRAM]
-    result = subprocess.run(run, capture_output=True, text=True, check=True).stdout
+    result = run_program(sys.executable, "-c", PROGRAM)
     if vector_width() == 16:
         assert result.split() == ["True", "False", "True"]
     else:

@@ -1,11 +1,10 @@
 """Linters, formatter, spelling and layers, as configured in pyproject.toml."""
 
-import subprocess
 import sys
 from importlib.util import find_spec
 
 import pytest
-from conftest import REPOSITORY
+from conftest import run_program
 
 LAYERS = "-c from importlinter.cli import lint_imports; exit(lint_imports(no_cache=True))"
 
@@ -24,7 +23,4 @@ def test_source_is_clean(name):
         pytest.skip(f"{module} is not installed")
     option, _, arguments = command.partition(" ")
     arguments = [arguments] if option == "-c" else arguments.split()
-    result = subprocess.run(
-        [sys.executable, option, *arguments], cwd=REPOSITORY, capture_output=True, text=True
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
+    run_program(sys.executable, option, *arguments)

@@ -3,12 +3,11 @@
 import importlib.metadata
 import runpy
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from conftest import REPOSITORY
+from conftest import REPOSITORY, run_program
 
 CHECKER = shutil.which("basedpyright", path=str(Path(sys.executable).parent))
 
@@ -16,10 +15,8 @@ CHECKER = shutil.which("basedpyright", path=str(Path(sys.executable).parent))
 @pytest.mark.slow
 @pytest.mark.skipif(CHECKER is None, reason="basedpyright is not installed")
 def test_type_checker_finds_no_errors():
-    """As an editor and ``basedpyright`` on the command line do, by ``pyproject.toml``."""
-    command = [CHECKER, "--pythonpath", sys.executable]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
+    """With the settings of ``pyproject.toml``, as in an editor and on the command line."""
+    run_program(CHECKER, "--pythonpath", sys.executable)
 
 
 def test_stubs_are_those_of_the_installed_mitsuba(tmp_path):

@@ -102,7 +102,6 @@ def test_unknown_box_is_derived_from_the_cameras():
 
 FEW_MASKS = replace(OPAQUE, train=(*BALL.train[:2], *OPAQUE.train[2:]))
 
-
 REFUSED = [
     (FEW_MASKS, {"start": "masks"}, "init.start: masks needs nearly all .*, but only 2 are; cut"),
     (BALL, {"start": "points"}, "init.start: points needs a point cloud, and the dataset names no"),

@@ -36,6 +36,7 @@ from support.differentiable_scenes import (
     scene,
     tensor,
 )
+from support.kernels import kernels_of
 from support.openexr import read_exr
 from support.views import gradients_of
 
@@ -371,13 +372,6 @@ def test_derivatives_of_detached_cameras_are_not_computed(name, monkeypatch):
     loaded, other = (mi.load_dict((SCENES | UNSTORED_SCENES)[name]()) for _ in range(2))
     params = mi.traverse(loaded)
     dr.enable_grad(params["integrator.means"])
-
-    def kernels_of(action) -> list:
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            action()
-            history = dr.kernel_history([dr.KernelType.JIT])
-        return [(kernel["hash"], kernel["operation_count"]) for kernel in history]
 
     def plain():
         loaded.integrator().state.cache.forget("frames")

@@ -1,12 +1,12 @@
 """``splats`` inside Mitsuba's ``aov``, against the same integrator alone."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.views import VIEWS, Scene, View, gradient, image_of, tensors
+from support.views import VIEWS, Scene, View, gradient, image_of, side_by_side, tensors
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES
@@ -19,29 +19,18 @@ TOLERANCE = 3e-5
 
 OWN_AOVS = "t:depth, a:alpha"
 
-
-@dataclass(frozen=True)
-class SensorView(View):
-    """The view through a sensor of another type; its lens need not see the same part."""
-
-    others: tuple = ()  # (name, value) of the sensor's parameters
-
-    def sensor(self, **film) -> dict:
-        sensor = super().sensor(**film)
-        kept = ("near_clip", "to_world", "film", "sampler")
-        return {name: sensor[name] for name in kept} | dict(self.others)
-
-
-THIN = (("type", "thinlens"), ("fov", 50.0), ("aperture_radius", 0.05), ("focus_distance", 2.3))
-LENS = (("type", "calibrated"), ("fx", 40.0), ("lens", "opencv"), ("k1", -0.1))
+LENS = {"fx": 40.0, "lens": "opencv", "k1": -0.1}
+THIN = {"fov": 50.0, "aperture_radius": 0.05, "focus_distance": 2.3}
+PLAIN = View("")
 SENSORS = {
     "perspective": VIEWS[1],
     "crop window": VIEWS[12],
-    "thinlens": SensorView("", others=THIN),
-    "orthographic": SensorView("", others=(("type", "orthographic"),)),
-    "calibrated": SensorView("", others=LENS),
-    "fisheye": SensorView("", others=(*LENS[:2], ("lens", "fisheye"), ("k1", -0.02))),
+    "thinlens": PLAIN.with_sensor("thinlens", **THIN),
+    "orthographic": PLAIN.with_sensor("orthographic"),
+    "calibrated": PLAIN.with_sensor("calibrated", **LENS),
+    "fisheye": PLAIN.with_sensor("calibrated", fx=40.0, lens="fisheye", k1=-0.02),
 }
+"""Views; another type's lens need not see the same part."""
 
 
 def wall(view) -> dict:
@@ -161,24 +150,18 @@ def test_unsupported_integrators_are_refused():
     )
 
 
-MOVING = (*LENS, ("shutter_close", 1.0))
-
-
 @pytest.mark.parametrize("case", ["border", "moving", "batch"])
 def test_rays_not_covering_the_film_are_refused(case):
     view, film = VIEWS[1], {}
     if case == "border":
         film = {"sample_border": True, "rfilter": "gaussian"}
     if case == "moving":
-        close = mi.ScalarTransform4f().translate([0.1, 0, 0])
-        view = SensorView("", others=(*MOVING, ("to_world_close", close)))
+        close = {"to_world_close": lambda: mi.ScalarTransform4f().translate([0.1, 0, 0])}
+        view = PLAIN.with_sensor("calibrated", **LENS, shutter_close=1.0, **close)
     loaded = load(Scene(view), AOV, **film)
     arguments = {}
     if case == "batch":
-        sensor = view.sensor()
-        batch = {"type": "batch", "a": sensor, "b": sensor, "film": sensor["film"]}
-        batch["film"] = batch["film"] | {"width": 2 * view.width}
-        arguments = {"sensor": mi.load_dict(batch | {"sampler": sensor["sampler"]})}
+        arguments = {"sensor": mi.load_dict(side_by_side(view, view))}
     message = refusal(loaded, **arguments)
     assert message.startswith("splats: inside 'aov', rays must be those of the whole film")
 

@@ -9,14 +9,23 @@ from support.backgrounds import (
     EMITTERS,
     IMAGE,
     VIEW,
-    Camera,
     calibrated,
     integrator_of,
     load,
     rendered,
     texels,
 )
-from support.views import VIEWS, Scene, decode, gradients_of, image_of, to_linear
+from support.kernels import launched
+from support.views import (
+    VIEWS,
+    Scene,
+    View,
+    decode,
+    gradients_of,
+    image_of,
+    side_by_side,
+    to_linear,
+)
 from support.wall_scenes import to_display
 
 import drgs  # noqa: F401  (registers the plugins)
@@ -24,12 +33,12 @@ from drgs.reference import effects
 from drgs.reference import splatting as reference
 
 CAMERAS = {
-    "perspective": Camera(),
-    "rolled": Camera(VIEWS[2]),
-    "mirrored": Camera(VIEWS[3]),
-    "principal point": Camera(VIEWS[10]),
-    "crop window": Camera(VIEWS[13]),
-    "orthographic": Camera(changes={"type": "orthographic"}),
+    "perspective": VIEW,
+    "rolled": VIEWS[2],
+    "mirrored": VIEWS[3],
+    "principal point": VIEWS[10],
+    "crop window": VIEWS[13],
+    "orthographic": VIEW.with_sensor("orthographic"),
     "calibrated": calibrated(),
     "opencv": calibrated(lens="opencv", k1=-0.25, k2=0.0625, p1=0.0078125),
     "barrel": calibrated(lens="opencv", k1=-0.3125, fx=18.0, fy=18.0),
@@ -39,21 +48,19 @@ CAMERAS = {
     ),
 }
 
-
 both_emitters = pytest.mark.parametrize("emitter", EMITTERS)
-
 
 ON_BLACK = {"background": 0.0, "srgb_primitives": False}
 
 
 def image_before(sky, camera=None, spp=1, seed=0, is_hidden=False, **settings) -> np.ndarray:
     """Splats before an emitter; ``is_hidden``: the splats are transparent."""
-    camera = camera or Camera()
+    camera = camera or VIEW
     objects = {} if sky is None else {"sky": sky}
     if is_hidden:
         settings["logit_opacities"] = mi.TensorXf(np.full(40, -20, np.float32))
-    integrator = integrator_of(Scene(camera.view).gaussians, **settings)
-    return image_of(load(camera.dictionary(), integrator, **objects), spp=spp, seed=seed)
+    integrator = integrator_of(Scene(camera).gaussians, **settings)
+    return image_of(load(camera.sensor(), integrator, **objects), spp=spp, seed=seed)
 
 
 def environment_image(sensor, emitter) -> np.ndarray:
@@ -93,7 +100,7 @@ def test_environment_shows_behind_the_splats(camera, srgb_primitives, emitter):
     settings = {"srgb_primitives": srgb_primitives, "background": [0.2, 0.4, 0.6]}
     image = image_before(EMITTERS[emitter](), camera, **settings)
     splats = image_before(None, camera, **ON_BLACK)
-    behind = environment_image(camera.dictionary(), emitter)
+    behind = environment_image(camera.sensor(), emitter)
     np.testing.assert_allclose(
         image, composite_over(splats, behind, srgb_primitives), atol=2 * IMAGE
     )
@@ -106,9 +113,7 @@ def test_environment_behind_splats_matches_path(emitter):
     """With as many samples at the same points: Mitsuba's samplers give both the same."""
     actual = image_before(EMITTERS[emitter](), is_hidden=True, spp=9, seed=7)
     path, other = (
-        image_of(
-            load(Camera().dictionary(), {"type": "path"}, sky=EMITTERS[emitter]()), spp=9, seed=s
-        )
+        image_of(load(VIEW.sensor(), {"type": "path"}, sky=EMITTERS[emitter]()), spp=9, seed=s)
         for s in (7, 8)
     )
     np.testing.assert_allclose(actual, path, atol=IMAGE)
@@ -137,8 +142,8 @@ def test_a_background_texture_is_stretched_over_the_film_upright(view, srgb_prim
     """A texel for each pixel of the whole film, of which a crop window shows a part."""
     values = texels(view.height, view.width, seed=5)
     settings = {"background": rendered(values), "srgb_primitives": srgb_primitives}
-    image = image_before(None, Camera(view), **settings)
-    splats = image_before(None, Camera(view), **ON_BLACK)
+    image = image_before(None, view, **settings)
+    splats = image_before(None, view, **ON_BLACK)
     expected = composite_over(splats, values[view.window].astype(np.float64), srgb_primitives=False)
     if srgb_primitives:  # it is the last splat
         expected = to_linear(expected)
@@ -154,7 +159,7 @@ def test_defocused_environment_is_the_mean_of_pinholes_in_the_aperture():
     """The pinholes' principal points agree on the plane in focus."""
     lens = effects.ThinLens(0.25, 1.25)
     aperture = {"aperture_radius": 0.25, "focus_distance": 1.25}
-    sensor = Camera(changes={"type": "thinlens", "fov": 55.0, **aperture})
+    sensor = VIEW.with_sensor("thinlens", fov=55.0, **aperture)
     image = image_before(EMITTERS["envmap"](), sensor, is_hidden=True)
     height, width = image.shape[:2]
     focal = width / 2 / np.tan(np.radians(55) / 2)
@@ -179,7 +184,7 @@ def pose_at(time) -> np.ndarray:
     return pose
 
 
-def moving(**changes) -> Camera:
+def moving(**changes) -> View:
     return calibrated(to_world_close=lambda: mi.ScalarTransform4f(CLOSE), **changes)
 
 
@@ -228,13 +233,6 @@ def floor() -> dict:
     return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
 
 
-def side_by_side() -> dict:
-    sensor = Camera().dictionary()
-    views = {name: Camera(view).dictionary() for name, view in (("a", VIEW), ("b", VIEWS[2]))}
-    film = sensor["film"] | {"width": 2 * VIEW.width}
-    return {"type": "batch", "film": film, "sampler": sensor["sampler"], **views}
-
-
 KEYS = {
     "constant": "sky.radiance.value",
     "envmap": "sky.data",
@@ -263,7 +261,7 @@ def test_gradients_reach_the_inputs_of_the_radiance(way, kind):
     if way.startswith("surface"):
         objects["floor"] = floor()
         settings |= {"nested": {"type": "prb", "max_depth": 2}, "nested_spp": 4}
-    sensor = side_by_side() if way == "batch" else Camera().dictionary()
+    sensor = side_by_side(VIEW, VIEWS[2]) if way == "batch" else VIEW.sensor()
     loaded = load(sensor, integrator_of(Scene().gaussians, **settings), **objects)
     params = mi.traverse(loaded)
     start = {key: type(params[key])(params[key]) for key in (KEYS[kind], *FACTORED[way])}
@@ -300,7 +298,7 @@ def test_derivatives_of_constant_radiance_have_the_same_bytes_in_two_runs():
     runs, weights = [], np.random.default_rng(1).normal(size=(VIEW.height, VIEW.width, 4))
     for _ in range(2):
         integrator = integrator_of(Scene().gaussians)
-        loaded = load(Camera().dictionary(), integrator, sky=EMITTERS["constant"]())
+        loaded = load(VIEW.sensor(), integrator, sky=EMITTERS["constant"]())
         runs.append(gradients_of(loaded, weights, [KEYS["constant"]], prefix="")[KEYS["constant"]])
     np.testing.assert_array_equal(*runs)
     assert runs[0].all()
@@ -308,7 +306,7 @@ def test_derivatives_of_constant_radiance_have_the_same_bytes_in_two_runs():
 
 def test_a_changed_environment_needs_no_new_frame_and_no_new_kernel():
     integrator = integrator_of(Scene().gaussians)
-    loaded = load(Camera().dictionary(), integrator, sky=EMITTERS["constant"]())
+    loaded = load(VIEW.sensor(), integrator, sky=EMITTERS["constant"]())
 
     def set_to(value):
         params = mi.traverse(loaded)
@@ -319,9 +317,6 @@ def test_a_changed_environment_needs_no_new_frame_and_no_new_kernel():
     set_to([0.1, 0.2, 0.3])
     set_to([0.2, 0.3, 0.4])
     frames = loaded.integrator().state.cache.kept["frames 0"]
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        set_to([0.3, 0.4, 0.5])
-        history = dr.kernel_history([dr.KernelType.JIT])
+    history = launched(lambda: set_to([0.3, 0.4, 0.5]))
     assert history and all(kernel["cache_hit"] for kernel in history)
     assert loaded.integrator().state.cache.kept["frames 0"] is frames

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.helpers import bitwise, clear
-from support.views import VIEWS, Scene, gradients_of, image_of
+from support.views import VIEWS, Scene, gradients_of, image_of, side_by_side
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES
@@ -23,11 +23,8 @@ def load(sensor, wall=False, **others):
 
 
 def batch(samples=1, rfilter="box", pixel_format="rgba", **film):
-    view = SENSORS[0]
-    whole = view.sensor(pixel_format, rfilter, samples)
-    whole["film"] |= {"width": view.width * len(SENSORS)} | film
-    children = {f"view_{k}": one.sensor() for k, one in enumerate(SENSORS)}
-    return {"type": "batch", "film": whole["film"], "sampler": whole["sampler"], **children}
+    given = {"samples": samples, "rfilter": rfilter, "pixel_format": pixel_format}
+    return side_by_side(*SENSORS, **given, **film)
 
 
 def weights_of(seed=2) -> np.ndarray:

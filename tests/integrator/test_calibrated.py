@@ -202,7 +202,7 @@ def test_sharing_kernels_among_poses_changes_no_byte(monkeypatch):
     weights = np.random.default_rng(1).normal(0, 1, (21, 26, 4))
     results = []
     for poses in (16, 2):
-        monkeypatch.setattr("drgs.integrator.sensor_render.PASSES_PER_KERNEL", poses)
+        monkeypatch.setattr("drgs.integrator.image_render.PASSES_PER_KERNEL", poses)
         gradients = gradients_of(splats_scene(sensor, gaussians), weights, PARAMETER_NAMES)
         results.append({"image": image_of(splats_scene(sensor, gaussians)), **gradients})
     for name, expected in results[0].items():

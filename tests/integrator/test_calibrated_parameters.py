@@ -23,12 +23,10 @@ from drgs.reference.effects import OpenCV
 
 OTHER_POSE = pose([1, 2, 3], 30, (0.5, -0.6, 1.0))
 
-
 CHANGES = {
     **{"to_world": OTHER_POSE, "to_world_close": OTHER_POSE},
     **{"fx": 33.0, "fy": 33.0, "cx": 19.0, "cy": 19.0, "k1": -0.125, "p1": -0.03125},
 }
-
 
 MOVING_SENSOR = replace(OPENCV, close=CLOSE, shutter="rolling")
 

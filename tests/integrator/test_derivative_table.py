@@ -21,7 +21,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
-from support.lit_scenes import camera, gaussians
+from support.lit_scenes import camera
+from support.reference_lenses import gaussians_at
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import UnsupportedError
@@ -87,6 +88,7 @@ COPPER = {"eta": rgb(0.2, 0.9, 1.1), "k": rgb(3.9, 2.4, 2.1)}
 MIRROR = {"type": "conductor", "specular_reflectance": rgb(0.6, 0.5, 0.4), **COPPER}
 GLASS = {"specular_reflectance": rgb(0.6), "specular_transmittance": rgb(0.7)}
 PLASTIC = {"diffuse_reflectance": rgb(0.4), "specular_reflectance": rgb(0.8)}
+NO_SKY = {"sky": None}
 
 
 def spot():
@@ -110,16 +112,20 @@ def area_lamp():
     }
 
 
-def mixed(*materials, **others):
-    names = ("first", "second")
-    return {**others, **dict(zip(names, materials, strict=False))}
+def blend(material):
+    return {"type": "blendbsdf", "weight": 0.4, "first": DIFFUSE, "second": material}
+
+
+def of_panel(name, *given, **more) -> Case:
+    """A parameter of the panel's material."""
+    return Case(f"panel.bsdf.{name}", *given, **more)
 
 
 def cases() -> dict[str, Case]:
     """Return cases by the parameter's name in the table."""
     bumps = np.random.default_rng(0).uniform(0, 1, (8, 8, 3)).astype(np.float32)
     texture = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(bumps)}
-    only = {"sky": None, "lamp": None}
+    only, masked = {"sky": None, "lamp": None}, {"type": "mask", "opacity": 0.6, "bsdf": DIFFUSE}
     return {
         "Gaussians' `sh0`": Case("integrator.sh0", move=random_direction, is_seen_alone=True),
         "Gaussians' `means`": Case(
@@ -157,59 +163,43 @@ def cases() -> dict[str, Case]:
         "`to_world` of an `area` lamp": Case(
             "area.to_world", others={**only, "area": area_lamp()}, move=translate(0, 1, 0)
         ),
-        "`diffuse` `reflectance`": Case("panel.bsdf.reflectance.value"),
-        "`conductor` `specular_reflectance`": Case("panel.bsdf.specular_reflectance.value", MIRROR),
-        "`conductor` `eta`, `k`": Case("panel.bsdf.k.value", MIRROR),
-        "`roughconductor` `alpha`": Case("panel.bsdf.alpha.value", METAL, {"sky": None}),
-        "`dielectric` `specular_...`": Case(
-            "panel.bsdf.specular_reflectance.value", {"type": "dielectric", **GLASS}
+        "`diffuse` `reflectance`": of_panel("reflectance.value"),
+        "`conductor` `specular_reflectance`": of_panel("specular_reflectance.value", MIRROR),
+        "`conductor` `eta`, `k`": of_panel("k.value", MIRROR),
+        "`roughconductor` `alpha`": of_panel("alpha.value", METAL, NO_SKY),
+        "`dielectric` `specular_...`": of_panel(
+            "specular_reflectance.value", {"type": "dielectric", **GLASS}
         ),
-        "`roughdielectric` `alpha`": Case(
-            "panel.bsdf.alpha.value",
-            {"type": "roughdielectric", "alpha": 0.4},
-            {"sky": None},
-            spp=4096,
+        "`roughdielectric` `alpha`": of_panel(
+            "alpha.value", {"type": "roughdielectric", "alpha": 0.4}, NO_SKY, spp=4096
         ),
-        "`roughdielectric` `eta`": Case("panel.bsdf.eta", {"type": "roughdielectric"}),
-        "`thindielectric` `specular_reflectance`": Case(
-            "panel.bsdf.specular_reflectance.value", {"type": "thindielectric", **GLASS}
+        "`roughdielectric` `eta`": of_panel("eta", {"type": "roughdielectric"}),
+        "`thindielectric` `specular_reflectance`": of_panel(
+            "specular_reflectance.value", {"type": "thindielectric", **GLASS}
         ),
-        "`thindielectric` `eta`, `specular_transmittance`": Case(
-            "panel.bsdf.eta", {"type": "thindielectric", **GLASS}
+        "`thindielectric` `eta`, `specular_transmittance`": of_panel(
+            "eta", {"type": "thindielectric", **GLASS}
         ),
-        "`plastic` `diffuse_reflectance`": Case(
-            "panel.bsdf.diffuse_reflectance.value", {"type": "plastic", **PLASTIC}
+        "`plastic` `diffuse_reflectance`": of_panel(
+            "diffuse_reflectance.value", {"type": "plastic", **PLASTIC}
         ),
-        "`plastic` `specular_reflectance`": Case(
-            "panel.bsdf.specular_reflectance.value", {"type": "plastic", **PLASTIC}
+        "`plastic` `specular_reflectance`": of_panel(
+            "specular_reflectance.value", {"type": "plastic", **PLASTIC}
         ),
-        "`roughplastic` `..._reflectance`": Case(
-            "panel.bsdf.diffuse_reflectance.value",
-            {"type": "roughplastic", "alpha": 0.4, **PLASTIC},
+        "`roughplastic` `..._reflectance`": of_panel(
+            "diffuse_reflectance.value", {"type": "roughplastic", "alpha": 0.4, **PLASTIC}
         ),
-        "`roughplastic` `alpha`, `eta`": Case("panel.bsdf.alpha", {"type": "roughplastic"}),
-        "`principled` `roughness`": Case(
-            "panel.bsdf.roughness.value",
-            {"type": "principled", "roughness": 0.6, "metallic": 0.8},
-            {"sky": None},
+        "`roughplastic` `alpha`, `eta`": of_panel("alpha", {"type": "roughplastic"}),
+        "`principled` `roughness`": of_panel(
+            "roughness.value", {"type": "principled", "roughness": 0.6, "metallic": 0.8}, NO_SKY
         ),
-        "`mask` `opacity`": Case(
-            "panel.bsdf.opacity.value", mixed(DIFFUSE, type="mask", opacity=0.6)
-        ),
-        "material in `mask`": Case(
-            "panel.bsdf.nested_bsdf.reflectance.value", mixed(DIFFUSE, type="mask", opacity=0.6)
-        ),
-        "`blendbsdf` `weight`, rough": Case(
-            "panel.bsdf.weight.value",
-            mixed(DIFFUSE, METAL, type="blendbsdf", weight=0.4),
-            {"sky": None},
-        ),
-        "`blendbsdf` `weight`, with a mirror": Case(
-            "panel.bsdf.weight.value", mixed(DIFFUSE, MIRROR, type="blendbsdf", weight=0.4)
-        ),
-        "`normalmap` `normalmap`": Case(
-            "panel.bsdf.normalmap.data",
-            mixed(DIFFUSE, type="normalmap", normalmap=texture),
+        "`mask` `opacity`": of_panel("opacity.value", masked),
+        "material in `mask`": of_panel("nested_bsdf.reflectance.value", masked),
+        "`blendbsdf` `weight`, rough": of_panel("weight.value", blend(METAL), NO_SKY),
+        "`blendbsdf` `weight`, with a mirror": of_panel("weight.value", blend(MIRROR)),
+        "`normalmap` `normalmap`": of_panel(
+            "normalmap.data",
+            {"type": "normalmap", "normalmap": texture, "bsdf": DIFFUSE},
             move=random_direction,
         ),
         "`to_world`, diffuse": Case(
@@ -227,7 +217,7 @@ def splats():
     rng = np.random.default_rng(1)
     means = rng.uniform(-1, 1, (10, 3)) * [1, 0.5, 1] + [0, 0.9, -0.5]
     colors = rng.uniform(0.2, 0.9, (10, 3))
-    found = gaussians(means, 0.3, 0.5, colors)
+    found = gaussians_at(means, 0.3, 0.5, colors)
     return {name: mi.TensorXf(v.astype(np.float32)) for name, v in vars(found).items()}
 
 

@@ -7,18 +7,18 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.helpers import FLOAT32, rows
-from support.lit_scenes import gaussians
 from support.rays import Rays, splats_of
+from support.reference_lenses import gaussians_at
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.integrator.rays import PathSegment
-from drgs.integrator.splat_transport import (
+from drgs.integrator.light.rays import PathSegment
+from drgs.integrator.light.splat_transport import (
     DECODING,
     ROULETTE_TRANSMITTANCE,
     RayTransport,
 )
 from drgs.light.walk import _hashes
-from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.footprint import Cutoffs
 
 RAYS, PATHS = 4, 8192
 
@@ -41,7 +41,7 @@ class Fog:
         colors = rng.uniform(0, 1, (self.count, 3))
         colors = np.round(colors) if self.is_contrasty else colors
         means = rng.normal(0, self.spread, (self.count, 3))
-        splats = gaussians(means, self.radius, self.opacity, colors)
+        splats = gaussians_at(means, self.radius, self.opacity, colors)
         cutoffs = Cutoffs(transmittance_stop=0.0)
         return RayTransport(splats_of(splats, FLOAT32, cutoffs), mi.Float(1), num_samples)
 

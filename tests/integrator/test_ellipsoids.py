@@ -37,7 +37,6 @@ from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
 KINDS = ("ellipsoids", "ellipsoidsmesh")
 
-
 both_kinds = pytest.mark.parametrize("kind", KINDS)
 
 

@@ -21,7 +21,7 @@ from support.kernels import float_reductions
 from support.views import image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.integrator import gathering
+from drgs.integrator import parts
 from drgs.splatting import rendering
 
 # ----------------------------------------------------------------------------------------------
@@ -76,7 +76,7 @@ def counted(monkeypatch):
         monkeypatch.setattr(owner, name, counting)
 
     count(rendering, "render")
-    count(gathering.Conversion, "gaussians")
+    count(parts.Conversion, "gaussians")
     return calls
 
 

@@ -22,7 +22,7 @@ from support.views import VIEWS, Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.core.errors import UnsupportedError
-from drgs.integrator import checks
+from drgs.integrator import state
 
 # ----------------------------------------------------------------------------------------------
 # Numbers at the border
@@ -258,9 +258,9 @@ def test_instances_of_surfaces_are_rendered_and_checked_once(monkeypatch):
     }
     scene = Scene(count=8)
     loaded = scene_with(tensors(scene.gaussians), scene.view, **objects)
-    held, checked = checks.check_instances(loaded, []), []
-    monkeypatch.setattr(checks.mi, "traverse", checked.append)
-    assert checks.check_instances(loaded, held) and not checked
+    held, checked = state.check_instances(loaded, []), []
+    monkeypatch.setattr(state.mi, "traverse", checked.append)
+    assert state.check_instances(loaded, held) and not checked
     monkeypatch.undo()
     mi.render(loaded, spp=1)
     with pytest.raises(UnsupportedError, match="shape group 'herd' holds Gaussians"):

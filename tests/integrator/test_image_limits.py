@@ -8,8 +8,8 @@ from support.wall_scenes import WALL
 
 import drgs
 from drgs.core.errors import PluginError
-from drgs.integrator import checks
-from drgs.integrator.checks import MAX_SAMPLES
+from drgs.integrator import image_render
+from drgs.integrator.image_render import MAX_SAMPLES
 
 SCENE = Scene(VIEWS[1], count=8)  # 37 x 23 px
 
@@ -83,7 +83,7 @@ def test_films_too_large_for_memory_are_refused(surfaces):
 
 @pytest.mark.parametrize(("available", "most"), [(2**50, 2**32 - 1), (2**33, 2**27)])
 def test_nested_samples_beyond_memory_are_refused(monkeypatch, available, most):
-    monkeypatch.setattr(checks, "available_memory", lambda: available)
+    monkeypatch.setattr(image_render, "available_memory", lambda: available)
     scene = load(objects={"wall": WALL.shape(SCENE.view.camera)}, nested_spp=10**9)
     assert refusal(scene) == (
         f"splats: on a film of 37 x 23 px, nested_spp (or spp) must be at most "

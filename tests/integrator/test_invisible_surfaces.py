@@ -5,14 +5,14 @@ from functools import cache
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.lit_scenes import camera, gaussians, scene_of
+from support.lit_scenes import camera, scene_of
+from support.reference_lenses import gaussians_at
 from support.views import image_of
 
 import drgs  # noqa: F401  (registers the plugins)
 
 ROUNDING = 4e-4
 """Mitsuba moves rays that go on from a surface by 1e-4: so much is the shift of what they see."""
-
 
 PANES = {
     "null": {"type": "null"},
@@ -26,7 +26,7 @@ def cloud():
     """Soft splats of many colours, between a camera at z = 4 and a wall at z = -2."""
     rng = np.random.default_rng(5)
     means = rng.uniform(-0.8, 0.8, (30, 3))
-    return gaussians(means, 0.3, 0.4, rng.uniform(0, 1, (30, 3)))
+    return gaussians_at(means, 0.3, 0.4, rng.uniform(0, 1, (30, 3)))
 
 
 def plane(z, bsdf) -> dict:

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.helpers import FLOAT32, device_gaussians
-from support.kernels import drain_kernels
+from support.kernels import kernels_of
 from support.splats_checks import ball_lamp_and_sky
 from support.views import Scene, image_of
 
@@ -35,18 +35,21 @@ def load(tensors, objects, **settings):
 
 def kernels_and_bytes(*arguments, **settings) -> tuple[list, list[bytes]]:
     """Load a scene, render it, differentiate the splats' colours; return kernels and bytes."""
-    dr.eval()  # what is still pending would be found here
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
+    arrays = []
+
+    def act():
         scene = load(*arguments, **settings)
         params = mi.traverse(scene)
         dr.enable_grad(params["integrator.sh0"])
         rendered = mi.render(scene, params, seed=1, spp=1)
         dr.backward(dr.mean(rendered, axis=None))
-        gradient = np.array(dr.grad(params["integrator.sh0"]))
-        assert gradient.any()
+        arrays.extend(np.array(a) for a in (rendered, dr.grad(params["integrator.sh0"])))
         dr.eval()
-        return drain_kernels(), [np.array(rendered).tobytes(), gradient.tobytes()]
+
+    dr.eval()  # what is still pending would be found here
+    kernels = kernels_of(act)
+    assert arrays[1].any()
+    return kernels, [array.tobytes() for array in arrays]
 
 
 @pytest.mark.parametrize("objects", [dict, surfaces], ids=["splats alone", "splats and surfaces"])
@@ -67,7 +70,8 @@ def test_light_has_no_effect_without_surfaces():
     """The property makes no kernel of its own, and no difference."""
     tensors = gaussians()
     plain = kernels_and_bytes(tensors, {})
-    assert kernels_and_bytes(tensors, {}, light="rays", exposure=3.0, light_samples=0) == plain
+    lit = {"light": "rays", "radiance_scale": 3.0, "light_samples": 0}
+    assert kernels_and_bytes(tensors, {}, **lit) == plain
     assert kernels_and_bytes(tensors, {}, light="rays", nested={"type": "splatpath"}) == plain
     # An environment sends light, but it has no surface to send it to.
     sky = {"sky": {"type": "constant"}}

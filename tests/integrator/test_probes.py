@@ -5,11 +5,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import REPOSITORY
-from support.lit_scenes import FAR_AWAY, camera, gaussians, scene_of
+from support.kernels import kernel_hashes
+from support.lit_scenes import FAR_AWAY, camera, scene_of
+from support.reference_lenses import gaussians_at
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import PluginError
-from drgs.integrator.mirrors import FlatMirror, Mirrors
+from drgs.integrator.light.mirrors import FlatMirror, Mirrors
 from drgs.light.probe import Probes
 from drgs.reference import splatting
 from drgs.results import metrics
@@ -32,7 +34,7 @@ def around(count=3000, seed=0, distance=2.5, size=0.1):
     towards *= distance / np.linalg.norm(towards, axis=1, keepdims=True)
     kept = (towards[:, 2] < 0.9 * distance) | (distance < 0.5)
     means = towards[kept]
-    return gaussians(means, size, 0.99, 0.5 + 0.4 * np.sin(2 * means))
+    return gaussians_at(means, size, 0.99, 0.5 + 0.4 * np.sin(2 * means))
 
 
 def render(splats, seed=0, **settings):
@@ -53,7 +55,7 @@ def test_mirror_ball_matches_traced_rays():
 def test_lamp_with_a_probe_is_dimmed_by_fog():
     """Fog before the lamp dims it by its alpha; up to 0.01, as rays with four times that."""
     rng = np.random.default_rng(1)
-    splats = gaussians(rng.uniform(-1, 1, (30, 3)) * [1, 1, 0.3] + [0, 0, 1.5], 0.4, 0.3, 0.0)
+    splats = gaussians_at(rng.uniform(-1, 1, (30, 3)) * [1, 1, 0.3] + [0, 0, 1.5], 0.4, 0.3, 0.0)
     wall = {
         "wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(2)},
         "lamp": {"type": "point", "id": "lamp", "position": [0.5, 0.3, 3], "intensity": 10.0},
@@ -82,7 +84,7 @@ def test_rays_unknown_to_a_probe_are_empty_or_traced():
     splats = splatting.Gaussians(**{k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
     settings = {"spp": 4, **mirror_ball()}
     found = {
-        unseen: render(splats, light="probe", probes="ball", unseen=unseen, **settings)
+        unseen: render(splats, light="probe", probes="ball", probe_fallback=unseen, **settings)
         for unseen in ("none", "rays")
     }
     np.testing.assert_array_equal(found["rays"], render(splats, light="rays", **settings))
@@ -93,10 +95,10 @@ def test_rays_unknown_to_a_probe_are_empty_or_traced():
 def test_probes_see_smoothed_gaussians():
     """A filter of 0.2 makes Gaussians of 0.1 as large as those of 0.224, and fainter."""
     means = around(60).means
-    wide = gaussians(means, np.hypot(0.1, 0.2), 0.9 * (0.1 / np.hypot(0.1, 0.2)) ** 3, 0.8)
+    wide = gaussians_at(means, np.hypot(0.1, 0.2), 0.9 * (0.1 / np.hypot(0.1, 0.2)) ** 3, 0.8)
     settings = {"light": "probe", "probes": "ball", "spp": 4, **mirror_ball()}
     smoothing = mi.Float(np.full(len(means), 0.2, np.float32))
-    smoothed = render(gaussians(means, 0.1, 0.9, 0.8), smoothing=smoothing, **settings)
+    smoothed = render(gaussians_at(means, 0.1, 0.9, 0.8), smoothing=smoothing, **settings)
     np.testing.assert_allclose(smoothed, render(wide, **settings), atol=1e-3)
 
 
@@ -135,8 +137,8 @@ def test_invalid_probe_settings_are_refused():
 
     with pytest.raises(RuntimeError, match="probes must be ids of shapes and emitters, got none"):
         scene()
-    with pytest.raises(RuntimeError, match="unseen must be one of none, rays, got 'guess'"):
-        scene(probes="ball", unseen="guess")
+    with pytest.raises(RuntimeError, match="probe_fallback must be one of none, rays, got 'guess'"):
+        scene(probes="ball", probe_fallback="guess")
     for name, message in (("bowl", "got 'bowl'; there are sky, ball"), ("sky", "infinitely far")):
         found = scene(probes=f"ball, {name}")
         with pytest.raises(PluginError, match=message):
@@ -179,7 +181,7 @@ def wall():
 def cloud(y=0.9, x=0.0, count=60):
     rng = np.random.default_rng(7)
     means = rng.uniform(-0.4, 0.4, (count, 3)) + np.array([x, y, 0])
-    return gaussians(means, 0.12, 0.95, rng.random((count, 3)))
+    return gaussians_at(means, 0.12, 0.95, rng.random((count, 3)))
 
 
 def scene(light="probe", splats=None, probes="floor", **others):
@@ -330,10 +332,7 @@ def test_camera_motion_needs_no_new_kernels():
         step = mi.Transform4f().translate(mi.Point3f(dr.opaque(mi.Float, 0.05), 0, 0))
         params["sensor.to_world"] = step @ params["sensor.to_world"]
         params.update()
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            dr.eval(mi.render(found))
-            kernels.append({kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])})
+        kernels.append(kernel_hashes(lambda: dr.eval(mi.render(found))))
     assert kernels[2] == kernels[1]
 
 

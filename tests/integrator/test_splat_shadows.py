@@ -1,29 +1,25 @@
 """Shadows of surfaces on splats, against closed forms."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from support.lit_scenes import camera
 from support.lit_scenes import scene_of as lit_scene
+from support.reference_lenses import gaussians_at
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import PluginError
-from drgs.integrator import shadows
-from drgs.integrator.shadows import GAMMA
+from drgs.integrator.light import shadows
+from drgs.integrator.light.shadows import GAMMA
 from drgs.reference import splatting
 
 
 def scene_of(means, shadows, **objects):
     """Discs that are thin, faint and grey, in the plane of x and y, with some harmonics."""
-    n, rng = len(means), np.random.default_rng(0)
-    splats = splatting.Gaussians(
-        means=np.asarray(means),
-        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
-        log_scales=np.tile(np.log([0.02, 0.02, 0.0005]), (n, 1)),
-        logit_opacities=np.full(n, np.log(0.01 / 0.99)),
-        sh0=np.full((n, 1, 3), 0.1),
-        shN=rng.normal(0, 0.1, (n, 3, 3)),
-    )
+    splats = gaussians_at(means, [0.02, 0.02, 0.0005], 0.01, colors=0.53)
+    splats = replace(splats, shN=np.random.default_rng(0).normal(0, 0.1, (len(means), 3, 3)))
     sensor = camera([0, -2, 1], [0, 0, 0], size=8, up=(0, 0, 1))
     settings = {"light": None, "nested": None, "spp": 1, "shadows": shadows}
     return lit_scene(splats, **settings, sensor=sensor, **objects)

@@ -9,12 +9,12 @@ from support.lit_scenes import (
     FAR_AWAY,
     along_rays,
     camera,
-    gaussians,
     mean_and_error,
     pixel_rays,
     radiance_of,
     scene_of,
 )
+from support.reference_lenses import gaussians_at
 from support.views import to_linear
 
 import drgs  # noqa: F401  (registers the plugins)
@@ -82,7 +82,7 @@ def test_a_mirror_shows_the_mirrored_gaussians(has_sky):
     """Exactly: all splats are composited, and one path is as good as many."""
     rng = np.random.default_rng(0)
     means = rng.normal(0, 0.5, (20, 3)) * [1, 1, 0.5] + [0, 0, 6]
-    splats = gaussians(means, 0.3, 0.7, rng.uniform(0, 1, (20, 3)))
+    splats = gaussians_at(means, 0.3, 0.7, rng.uniform(0, 1, (20, 3)))
     mirror = before_a_mirror()
     if has_sky:
         mirror["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": 0.0}}
@@ -154,10 +154,10 @@ class Furnace:
             },
         }
         scene = scene_of(
-            gaussians(np.zeros((2, 3)), 1e3, self.alpha, self.color),
+            gaussians_at(np.zeros((2, 3)), 1e3, self.alpha, self.color),
             max_depth=max_depth,
             light_samples=self.light_samples,
-            exposure=self.exposure,
+            radiance_scale=self.exposure,
             spp=64,
             wall=wall,
             lamp={"type": "point", "position": [0, 0, self.LAMP], "intensity": np.pi},
@@ -201,4 +201,4 @@ def test_bounces_in_a_furnace_of_fog_converge_to_its_radiance(furnace):
 
 def test_nested_integrators_that_see_no_splats_are_refused():
     with pytest.raises(RuntimeError, match="must be splatpath, got PathIntegrator"):
-        scene_of(gaussians([[0, 0, -1]]), nested="path", **room())
+        scene_of(gaussians_at([[0, 0, -1]], 0.3, 0.9, 1.0), nested="path", **room())

@@ -52,7 +52,8 @@ def test_xml_finds_a_file_beside_itself(parallel, tmp_path, monkeypatch):
 
 def test_repr_lists_non_default_settings():
     settings = {"aovs": "d:depth,a:alpha", "ignore": "motion", "hide_emitters": True}
-    given = tensors(Scene(degree=0).gaussians) | settings | {"low_pass": 0.1}
+    lit = {"light": "rays", "exposure": 2.0}  # a former name of radiance_scale
+    given = tensors(Scene(degree=0).gaussians) | settings | lit | {"low_pass": 0.1}
     del given["shN"]
     assert str(mi.load_dict({"type": "splats", **given})).splitlines() == [
         "SplatsIntegrator[",
@@ -64,6 +65,8 @@ def test_repr_lists_non_default_settings():
         "  low_pass = 0.1,",
         "  hide_emitters = True,",
         "  aovs = d:depth, a:alpha,",
+        "  light = rays,",
+        "  radiance_scale = 2.0,",
         "  ignore = motion",
         "]",
     ]

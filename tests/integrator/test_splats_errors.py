@@ -166,7 +166,6 @@ REFUSED = [
     ),
 ]
 
-
 NOT_BY_SPLATS = ("UserError: ", '"hide_emitters"')
 
 

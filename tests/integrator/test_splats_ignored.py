@@ -15,7 +15,7 @@ def pinhole(**changes) -> dict:
     """The view with a pinhole, by the ``calibrated`` sensor."""
     camera = VIEWS[1].camera
     intrinsics = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    return VIEWS[1].sensor_like("calibrated", **intrinsics | changes)
+    return VIEWS[1].with_sensor("calibrated", **intrinsics | changes).sensor()
 
 
 BENT = {"lens": "opencv", "k1": -0.25, "p1": 0.01}
@@ -30,7 +30,7 @@ def moving(**changes):
 IGNORED = {
     "distortion": ("distortion", lambda: pinhole(**BENT)),
     "fisheye": ("distortion", lambda: pinhole(lens="fisheye", k1=0.02)),
-    "defocus": ("defocus", lambda: VIEWS[1].sensor_like("thinlens", **BLURRED)),
+    "defocus": ("defocus", lambda: VIEWS[1].with_sensor("thinlens", **BLURRED).sensor()),
     "motion blur": ("motion", lambda: pinhole(**moving(shutter_samples=2))),
     "rolling shutter": ("motion", lambda: pinhole(**moving(shutter="rolling"))),
     "both": ("motion, distortion", lambda: pinhole(**BENT, **moving())),
@@ -55,7 +55,7 @@ def test_ignored_effects_leave_a_static_pinhole(case):
 
 def test_orthographic_lens_does_not_count_as_distortion():
     """No pinhole could take its place."""
-    sensor = VIEWS[1].sensor_like("orthographic")
+    sensor = VIEWS[1].with_sensor("orthographic").sensor()
     ignoring = image_of(Scene().load_with(sensor, ignore="distortion"))
     np.testing.assert_array_equal(ignoring, image_of(Scene().load_with(sensor)))
 

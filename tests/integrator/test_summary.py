@@ -26,9 +26,9 @@ MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
     "cameras.radial_tangential",
     "cameras.thin_prism_fisheye", "effects.defocus", "effects.occlusion",
-    "effects.smoothing", "gaussians.rotation", "gaussians.similarity", "integrator.gathering",
-    "integrator.splat_transport", "integrator.shadows",
-    "integrator.surfaces",
+    "effects.smoothing", "gaussians.rotation", "gaussians.similarity", "integrator.parts",
+    "integrator.light.splat_transport", "integrator.light.shadows",
+    "integrator.light.surfaces",
     "light", "light.grid", "light.probe", "light.walk",
 )  # fmt: skip
 """Modules used only by effects of images; a fit asks every effect whether it takes part."""
@@ -157,16 +157,16 @@ def test_plan_of_views_covers_all_views():
 
 def test_plan_of_sensors_covers_all_sensors():
     """A pinhole; one that is bent and moves; a thin lens; an orthographic one."""
-    to_world = {key: VIEWS[1].sensor()[key] for key in ("to_world", "film", "sampler")}
     close = {"to_world_close": VIEWS[0].sensor()["to_world"]}
-    thin = {"aperture_radius": 0.1, "focus_distance": 2.0}
-    sensors = [
-        VIEWS[1].sensor(),
-        {"type": "calibrated", **to_world, "lens": "opencv", "k1": 0.1, **close},
-        {"type": "thinlens", **to_world, "fov": 40.0, **thin},
-        {"type": "orthographic", **to_world},
+    thin = {"fov": 40.0, "aperture_radius": 0.1, "focus_distance": 2.0}
+    views = [
+        VIEWS[1],
+        VIEWS[1].with_sensor("calibrated", lens="opencv", k1=0.1, **close),
+        VIEWS[1].with_sensor("thinlens", **thin),
+        VIEWS[1].with_sensor("orthographic"),
     ]
-    cameras = [camera_from_sensor(read_sensor(mi.load_dict(s), 0.01)) for s in sensors]
+    sensors = [mi.load_dict(view.sensor()) for view in views]
+    cameras = [camera_from_sensor(read_sensor(sensor, 0.01)) for sensor in sensors]
 
     def lines(integrator, **surfaces):
         plan = summary_of_sensors(integrator.state, cameras, None, **surfaces)
@@ -291,20 +291,20 @@ def test_each_effect_imports_its_own_modules(run_python, tmp_path):
         "distorted": ["drgs.cameras.distortion", "drgs.cameras.radial_tangential"],
         "thin lens": ["drgs.effects.defocus"],
         "orthographic": ["drgs.cameras.orthographic"],
-        "surface": ["drgs.effects.occlusion", "drgs.integrator.surfaces"],
+        "surface": ["drgs.effects.occlusion", "drgs.integrator.light.surfaces"],
         "path": [],
         "splatpath": [],
         "light": [
-            "drgs.integrator.splat_transport",
+            "drgs.integrator.light.splat_transport",
             "drgs.light",
             "drgs.light.grid",
             "drgs.light.probe",
             "drgs.light.walk",
         ],
-        "shadows": ["drgs.integrator.shadows"],
+        "shadows": ["drgs.integrator.light.shadows"],
         "object in its place": [
             "drgs.gaussians.rotation",
             "drgs.gaussians.similarity",
-            "drgs.integrator.gathering",
+            "drgs.integrator.parts",
         ],
     }

@@ -324,7 +324,6 @@ def test_display_space_on_a_film_without_rgb_is_refused():
 
 RADIANCE_KEY = "wall.emitter.radiance.value"
 
-
 PERSPECTIVE = {"type": "perspective"}
 OF_CAMERAS = {
     "perspective": (PERSPECTIVE, ("to_world", "x_fov", "principal_point_offset_x")),

@@ -18,7 +18,7 @@ from drgs.io import formats
 from drgs.render import __main__ as render
 
 ROOT = Path(__file__).parents[2]
-EXAMPLE = ROOT / "tests" / "examples" / "npz_format.py"
+EXAMPLE = ROOT / "examples" / "npz_format.py"
 
 
 @pytest.fixture

@@ -56,7 +56,6 @@ COARSE = replace(
     harmonics=np.sqrt(7) * (1 / 256 + 16 / 256) + 4 * FLOAT32,  # 4 of 8 bits
 )
 
-
 TRUNCATED = replace(
     PRECISION["sog"],
     **{name: 2 * getattr(PRECISION["sog"], name) for name in ("means", "quats", "opacities")},

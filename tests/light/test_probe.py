@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.helpers import FLOAT32, both_precisions, device_gaussians, rows
 from support.rays import Rays
+from support.reference_lenses import gaussians_at
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
@@ -20,15 +21,7 @@ CENTERS = np.array([[0.0, 0, 0], [0.25, -0.1, 0.2]])
 
 
 def balls(means, sizes, colors, opacity=0.98) -> splatting.Gaussians:
-    n = len(means)
-    return splatting.Gaussians(
-        np.asarray(means, np.float32),
-        np.tile([1.0, 0, 0, 0], (n, 1)),
-        np.log(np.broadcast_to(np.reshape(sizes, (-1, 1)), (n, 3))),
-        np.full(n, np.log(opacity / (1 - opacity))),
-        ((np.asarray(colors) - 0.5) / splatting.C_00)[:, None],
-        np.zeros((n, 0, 3)),
-    )
+    return gaussians_at(np.float32(means), np.reshape(sizes, (-1, 1)), opacity, colors)
 
 
 def shell(count=24000, radius=1.5) -> splatting.Gaussians:

@@ -20,7 +20,7 @@ from support.views import VIEWS, splats_before
 from drgs.reference import light as reference
 from drgs.reference import rays as image_reference
 from drgs.reference import splatting
-from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.footprint import Cutoffs
 
 
 def random_gaussians(count, seed=0, spread=1.0, size=0.1, degree=3) -> splatting.Gaussians:

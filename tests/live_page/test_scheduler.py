@@ -10,12 +10,7 @@ import pytest
 from drgs.core.errors import UserError
 from drgs.live_page import scheduler
 from drgs.live_page.frames import FrameRequest, ViewerCamera, ViewerFrame
-from drgs.live_page.scheduler import (
-    MOVING_SECONDS,
-    STILL_SECONDS,
-    RenderRequests,
-    RenderScheduler,
-)
+from drgs.live_page.scheduler import MOVING_SECONDS, STILL_SECONDS, RenderRequests, RenderScheduler
 
 REQUEST = FrameRequest(ViewerCamera(np.eye(4), 40.0, 1.0), 800, 600)
 

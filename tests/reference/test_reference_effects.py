@@ -13,12 +13,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from support.reference_lenses import FISHEYE, THIN_PRISM, camera_at_origin, gaussians_at
-from support.reference_scenes import (
-    BACKGROUND,
-    assert_images_agree,
-    rotation_about,
-    small_scene,
-)
+from support.reference_scenes import BACKGROUND, assert_images_agree, rotation_about, small_scene
 
 from drgs.reference import effects
 from drgs.reference import splatting as reference

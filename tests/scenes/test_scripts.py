@@ -143,11 +143,11 @@ def test_useful_pairs_match_the_reference(load_script):
 
 
 def test_every_kernel_of_an_iteration_belongs_to_a_stage(load_script):
-    stages, before = load_script("stages"), rendering.bin_footprints
+    stages, before = load_script("stages"), rendering.bin_splats
     mi.set_variant("llvm_ad_rgb")
     scene = stages.Scene("small", scenes.bench_gaussians(500), scenes.bench_camera(48))
     clock = stages.clocked_step(stages.warm_trainer(scene))
-    assert rendering.bin_footprints is before
+    assert rendering.bin_splats is before
     assert {stage for stage, _ in clock.history} == set(stages.STAGES)
     assert all(clock.num_kernels(s) > 0 and clock.kernel_ms[s] > 0 for s in stages.STAGES)
 

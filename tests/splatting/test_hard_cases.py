@@ -19,12 +19,7 @@ exceeded with a probability of 3e-8 a number. A sum over n layers has n more.
 import numpy as np
 import pytest
 from support.hard_cases import FAMILIES, allowed, cotangents_of, errors_over_bounds, expected
-from support.helpers import (
-    both_precisions,
-    image_planes,
-    kernel_gradients,
-    render,
-)
+from support.helpers import both_precisions, image_planes, kernel_gradients, render
 
 from drgs.reference import splatting as reference
 

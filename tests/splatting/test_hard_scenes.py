@@ -73,7 +73,6 @@ def test_ten_thousand_gaussians_match_the_reference_in_float32(case):
 
 NOT_FINITE = Case("not finite", 21, 18, 1, count=30)
 
-
 MEANINGFUL_INFINITIES = {
     ("log_scales", -np.inf): "a scale of 0: a point, which the low-pass makes a pixel wide",
     ("logit_opacities", np.inf): "an opacity of 1",

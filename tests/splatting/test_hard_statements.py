@@ -4,13 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.hard_cases import (
-    FAMILIES,
-    PLANES,
-    camera_for,
-    cotangents_of,
-    splats,
-)
+from support.hard_cases import FAMILIES, PLANES, camera_for, cotangents_of, splats
 from support.helpers import (
     FLOAT32,
     FLOAT64,

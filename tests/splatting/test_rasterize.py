@@ -60,10 +60,10 @@ def test_band_size_does_not_change_the_result(band_slots, monkeypatch):
         return [values.tobytes() for values in found.values()]
 
     (frame,) = STACKED.frames(STACKED.values, FLOAT32.Float)[1]
-    pairs = CompositedPairs.find(frame.bins, frame.layers.stop, ONE_SAMPLE)
-    (whole,), expected = split_bands(frame.bins, pairs), gradients()
+    pairs = CompositedPairs.find(frame.tiles.bins, frame.tiles.stop, ONE_SAMPLE)
+    (whole,), expected = split_bands(frame.tiles.bins, pairs), gradients()
     monkeypatch.setattr(reduction, "BAND_SLOTS", band_slots)
-    bands = split_bands(frame.bins, pairs)
+    bands = split_bands(frame.tiles.bins, pairs)
     assert len(bands) > 1 and sum(band.num_slots for band in bands) == whole.num_slots
     assert [tile for band in bands for tile in band.tiles] == [*whole.tiles]
     assert gradients() == expected

@@ -284,3 +284,24 @@ def test_more_splats_than_ranks_are_refused(monkeypatch):
     splats = round_splats(FLOAT32, np.full((5, 2), 8.0))
     with pytest.raises(UserError, match="at most 4 Gaussians"):
         bin_splats(splats, TileGrid(16, 16))
+
+
+WORDS = np.unique(
+    [
+        *(1 << np.arange(32, dtype=np.uint64)),
+        *((1 << np.arange(1, 33, dtype=np.uint64)) - 1),
+        *np.random.default_rng(0).integers(1, 2**32, 1000, dtype=np.uint64),
+    ]
+).astype(np.uint32)
+
+
+def test_bits_are_found():
+    lowest = [(int(word) & -int(word)).bit_length() - 1 for word in WORDS]
+    highest = [int(word).bit_length() - 1 for word in WORDS]
+    np.testing.assert_array_equal(tiles.find_lowest_bit(dr.llvm.ad.UInt32(WORDS)), lowest)
+    np.testing.assert_array_equal(tiles._find_highest_bit(dr.llvm.ad.UInt32(WORDS)), highest)
+    of_none = (
+        tiles.find_lowest_bit(dr.llvm.ad.UInt32(0))[0],
+        tiles._find_highest_bit(dr.llvm.ad.UInt32(0))[0],
+    )
+    assert of_none == (1, 0), "places in the word"

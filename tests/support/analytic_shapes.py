@@ -5,7 +5,7 @@ import numpy as np
 from drgs.datasets.types import Dataset, View
 from support.datasets import look_at
 from support.lens_scenes import PINHOLE, kernel_lens
-from support.small_fits import reference_camera
+from support.small_capture import reference_camera
 
 WHITE = (1.0, 1.0, 1.0)
 DISTANCE = 4.0
@@ -97,7 +97,7 @@ def dataset_of_images(views, half_extent=1.3, background=WHITE, **fields):
 def opaque_at(view, points, lens=PINHOLE):
     """(N,) bool: whether the image shows something at the places of points (N, 3), world.
 
-    Projected by the reference. True where the image does not show them.
+    DirectProjection by the reference. True where the image does not show them.
     """
     camera = reference_camera(view)
     position = (points - view.center) @ view.camera_to_world[:3, :3]

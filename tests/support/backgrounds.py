@@ -1,6 +1,5 @@
 """Environments and images behind splats."""
 
-from dataclasses import dataclass, field
 from functools import cache
 
 import mitsuba as mi
@@ -33,27 +32,12 @@ EMITTERS = {
     },
 }  # fmt: skip
 
-
 CLOSE = np.array(pose([0.2, -1.0, 0.4], 46, (0.5, -0.65, 1.0)))
 INTRINSICS = {"fx": 30.0, "fy": 27.0, "cx": 17.0, "cy": 12.5}
 
 
-@dataclass(frozen=True)
-class Camera:
-    """A sensor; what replaces the view's own."""
-
-    view: View = VIEW
-    changes: dict = field(default_factory=dict)
-
-    def dictionary(self) -> dict:
-        if not self.changes:
-            return self.view.sensor()
-        changes = {k: v() if callable(v) else v for k, v in self.changes.items()}
-        return self.view.sensor_like(changes.pop("type"), **changes)
-
-
-def calibrated(**changes) -> Camera:
-    return Camera(changes={"type": "calibrated", **INTRINSICS, **changes})
+def calibrated(**changes) -> View:
+    return VIEW.with_sensor("calibrated", **{**INTRINSICS, **changes})
 
 
 def integrator_of(gaussians, **settings) -> dict:

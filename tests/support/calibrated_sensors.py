@@ -9,16 +9,10 @@ import numpy as np
 
 from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.reference.effects import (
-    Equirectangular,
-    Fisheye,
-    OpenCV,
-    Pinhole,
-    ThinPrismFisheye,
-)
+from drgs.reference.effects import Equirectangular, Fisheye, OpenCV, Pinhole, ThinPrismFisheye
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES
-from support.motion_checks import rolling_image
+from support.rolling_shutter import rolling_image
 from support.views import VIEWS, Scene, View, pose, splats_before
 
 WINDOW = (13, 7, 29, 18)
@@ -56,20 +50,11 @@ class Calibrated:
         return {} if isinstance(self.lens, Equirectangular) else numbers
 
     def dictionary(self, **others) -> dict:
-        common = self.view.sensor()
-        kind = KINDS[type(self.lens)]
-        moves = {} if self.close is None else {"to_world_close": transform(self.close)}
-        return {
-            "type": "calibrated",
-            "lens": kind,
-            **self.intrinsics,
-            **self.coefficients,
-            **{name: common[name] for name in ("near_clip", "to_world", "film", "sampler")},
-            **moves,
-            "shutter": self.shutter,
-            "shutter_samples": SHUTTER_SAMPLES,
-            **others,
-        }
+        given = {"lens": KINDS[type(self.lens)], **self.intrinsics, **self.coefficients}
+        given |= {"shutter": self.shutter, "shutter_samples": SHUTTER_SAMPLES}
+        if self.close is not None:
+            given["to_world_close"] = transform(self.close)
+        return self.view.with_sensor("calibrated", **given | others).sensor()
 
     def load(self, **others) -> mi.Sensor:
         return mi.load_dict(self.dictionary(**others))
@@ -89,17 +74,12 @@ class Calibrated:
     def camera_at(self, time: float) -> reference.Camera:
         return effects.camera_at(self.camera, self.close_camera, time)
 
-    # What rolling_image expects of a case
-    width = property(lambda self: self.camera.width)
-    height = property(lambda self: self.camera.height)
-    rendered_degree, background = 1, (0.0, 0.0, 0.0)
-
     def rendered(self, gaussians) -> reference.RenderedImage:
         """The whole film by the reference, on black; motion with SHUTTER_SAMPLES."""
         if self.close is None:
             return effects.render(gaussians, self.camera, self.lens, threshold_width=NEAR_THRESHOLD)
         if self.shutter == "rolling":
-            return rolling_image(self, gaussians, NEAR_THRESHOLD)
+            return rolling_image(gaussians, self.camera_at, self.lens, 1, NEAR_THRESHOLD)
         return effects.render_motion_blur(
             gaussians, self.camera, self.close_camera, SHUTTER_SAMPLES, np.zeros(3), self.lens,
             NEAR_THRESHOLD,
@@ -174,7 +154,7 @@ SCALED = {
 
 def own_sensor(kind, view) -> dict:
     aperture = {"fov": view.fov, "aperture_radius": 0.125, "focus_distance": 3.0}
-    return view.sensor_like(kind, **(aperture if kind == "thinlens" else {}))
+    return view.with_sensor(kind, **(aperture if kind == "thinlens" else {})).sensor()
 
 
 def own_camera(view) -> reference.Camera:

@@ -15,16 +15,19 @@ from drgs.cameras.motion import MotionBlur, RollingShutter
 from drgs.core.arrays import types_of
 from drgs.reference import effects, rays
 from drgs.reference import splatting as reference
-from drgs.testing import (
-    Case,
-    Values,
-    adjoint_is_transpose,
-    bytes_are_reproducible,
-    single,
-)
+from drgs.testing import Case, Values, adjoint_is_transpose, bytes_are_reproducible, single
 from support import helpers
 from support.helpers import NEAR_THRESHOLD
-from support.lens_scenes import LENSES, kernel_lens
+from support.lens_scenes import (
+    FOCAL,
+    LENSES,
+    gaussians_at_points,
+    kernel_lens,
+    point_beyond_lens_limit,
+    seen_points,
+)
+from support.rolling_shutter import rolling_image
+from support.smoothing import smoothed_reference
 
 MOTION_SAMPLES = 3
 PINHOLE = effects.Pinhole()
@@ -60,17 +63,14 @@ MODEL_FIELDS = set(rays.ImageModel.__dataclass_fields__)
 
 def by_effects(case, values, lens=PINHOLE):
     """Lenses, with an aperture and a smoothing filter."""
+    gaussians = reference.Gaussians(**values)
     if case.smoothing is not None:
-        rates = np.full(case.count, np.sqrt(effects.SMOOTHING_VARIANCE) / case.smoothing)
-        given = values["log_scales"], values["logit_opacities"], rates
-        scales, opacities = effects.smoothing_filter(*given)
-        logits = np.log(opacities / (1 - opacities))
-        values = {**values, "log_scales": np.log(scales), "logit_opacities": logits}
+        gaussians = smoothed_reference(gaussians, np.full(case.count, case.smoothing))
     defocus = case.aperture and effects.ThinLens(*case.aperture)
     antialiased = case.approximations.get("antialiased", False)
     return planes_of(
         effects.render(
-            reference.Gaussians(**values), reference_camera(case), lens, np.zeros(3), antialiased,
+            gaussians, reference_camera(case), lens, np.zeros(3), antialiased,
             defocus, case.degree, NEAR_THRESHOLD,
         )
     )  # fmt: skip
@@ -79,33 +79,38 @@ def by_effects(case, values, lens=PINHOLE):
 TRAVEL, TURN = np.array([0.125, -0.0625, 0.03125]), np.array([0.03125, 0.0625, -0.09375])
 
 
-def close_camera(case) -> reference.Camera:
-    """The camera when the shutter closes: moved by TRAVEL (world), turned by TURN (camera axes)."""
-    camera = reference_camera(case)
-    angle = np.linalg.norm(TURN)
-    quat = np.array([[np.cos(angle / 2), *(np.sin(angle / 2) * TURN / angle)]])
-    rotation = reference.quat_to_rotation(quat)[0] @ camera.rotation
-    return replace(camera, rotation=rotation, center=camera.center + TRAVEL)
+def close_camera(camera, travel=TRAVEL, turn=TURN) -> reference.Camera:
+    """The camera when the shutter closes: moved by travel (world), turned by turn (camera axes)."""
+    rotation = Rotation.from_rotvec(turn).as_matrix() @ camera.rotation
+    return replace(camera, rotation=rotation, center=camera.center + travel)
 
 
-def shutter(kind, *arguments):
+def shutter(kind, *arguments, travel=TRAVEL, turn=TURN):
     """Make the shutter of a camera."""
 
     def make(camera):
         Array3f = types_of(type(camera.near)).Array3f
-        return kind(Array3f(*map(float, TRAVEL)), Array3f(*map(float, TURN)), *arguments)
+        return kind(Array3f(*map(float, travel)), Array3f(*map(float, turn)), *arguments)
 
     return make
 
 
 def by_motion(case, values, lens=PINHOLE):
-    cameras = reference_camera(case), close_camera(case)
-    gaussians = reference.Gaussians(**values)
+    camera = reference_camera(case)
     return planes_of(
         effects.render_motion_blur(
-            gaussians, *cameras, MOTION_SAMPLES, np.zeros(3), lens, NEAR_THRESHOLD
+            reference.Gaussians(**values), camera, close_camera(camera), MOTION_SAMPLES,
+            np.zeros(3), lens, NEAR_THRESHOLD,
         )
-    )
+    )  # fmt: skip
+
+
+def by_rows(case, values, lens=PINHOLE):
+    """A rolling shutter: each splat as a whole at the time when the row of its mean is read."""
+    camera = reference_camera(case)
+    camera_at = partial(effects.camera_at, camera, close_camera(camera))
+    gaussians = reference.Gaussians(**values)
+    return planes_of(rolling_image(gaussians, camera_at, lens, case.degree, NEAR_THRESHOLD))
 
 
 # ----------------------------------------------------------------------------------------------
@@ -204,29 +209,60 @@ def all_around(case) -> Values:
     }
 
 
+def edges_behind(lens, case) -> Values:
+    """Splats on and around the film of a lens, and ten that are hard.
+
+    Straight behind the camera; nearer than the near plane; too transparent; four large ones far
+    beyond each side of the film; one whose parameters are those of a fresh Gaussian; one on the
+    axis; one beyond what the lens model is made for.
+    """
+    rng, camera, n = np.random.default_rng(case.seed), reference_camera(case), case.count
+    size = np.array([case.width, case.height])
+    film, distances = rng.uniform(-0.15, 1.15, (n, 2)) * size, rng.uniform(1.0, 4.0, n)
+    sizes = np.minimum(rng.lognormal(np.log(1.5), 0.9, (n, 3)), 0.2 * max(size) + 1)
+    logits = rng.normal(0.5, 1.7, n)
+    distances[1], logits[2] = 0.1, -6.0
+    film[1:3] = size * np.array([[0.3, 0.4], [0.6, 0.3]])
+    film[3:7] = size * np.array([[-0.6, 0.5], [1.6, 0.4], [0.3, -0.6], [0.6, 1.6]])
+    sizes[3:7], logits[3:7] = 0.3 * max(size), 2.0
+    film[7], sizes[7], logits[7] = 0.4 * size, 2.0, 0.0
+    film[8] = camera.cx, camera.cy
+    points = seen_points(lens, camera, film, distances)
+    points[0] = [0, 0, -1]
+    beyond = point_beyond_lens_limit(lens)
+    points[9] = beyond if beyond is not None else points[9]
+    gaussians = gaussians_at_points(lens, rng, camera, points, sizes, logits, case.degree)
+    gaussians.quats[7], gaussians.sh0[7] = [1, 0, 0, 0], 0
+    return vars(gaussians)
+
+
+def large_behind(lens, case) -> Values:
+    """Splats as large as the film, most with their means beside it."""
+    rng, camera, n = np.random.default_rng(case.seed), reference_camera(case), case.count
+    size = np.array([case.width, case.height])
+    film = rng.uniform(-0.4, 1.4, (n, 2)) * size
+    points = seen_points(lens, camera, film, rng.uniform(1, 3, n))
+    sizes, logits = rng.uniform(0.1, 0.8, (n, 3)) * max(size), rng.normal(-1.0, 1.0, n)
+    return vars(gaussians_at_points(lens, rng, camera, points, sizes, logits, case.degree))
+
+
 # ----------------------------------------------------------------------------------------------
 # The matrix
 # ----------------------------------------------------------------------------------------------
 
 ALL_LENSES = {"pinhole": PINHOLE, **LENSES}
 
-# px: films of fisheyes reach beyond 90 degrees from the axis; that of parallel rays is 3 units.
-FOCAL = {
-    **{effects.Fisheye: 10.0, effects.ThinPrismFisheye: 10.0, effects.Orthographic: 12.0},
-    effects.Equirectangular: 6.0,
-}
 
-
-def with_lens(name, effect, reference_of, **options) -> Case:
+def with_lens(name, effect="lens", reference_of=by_effects, **options) -> Case:
     """A case with a lens of the reference and of the kernels."""
     lens = ALL_LENSES[name]
-    if name != "pinhole":
-        options["lens"] = kernel_lens(lens)
     options.setdefault("focal", FOCAL.get(type(lens), 26.0))
     if isinstance(lens, effects.Equirectangular):
         options.setdefault("scene", all_around)
+    if (effect, name) == ("rolling shutter", "panorama"):
+        reference_of = None  # a mean may be in several rows: which one shows it is open
     found = reference_of and partial(reference_of, lens=lens)
-    return Case(f"{effect}, {name}", reference=found, **options)
+    return Case(f"{effect}, {name}", kernel_lens(lens), reference=found, **options)
 
 
 APPROXIMATIONS = {
@@ -267,7 +303,7 @@ EFFECTS = {
     "thin lens": (by_effects, {"aperture": (0.0625, 2.0)}),
     "smoothing": (by_effects, {"smoothing": 0.0625}),
     "motion blur": (by_motion, {"shutter": shutter(MotionBlur, MOTION_SAMPLES)}),
-    "rolling shutter": (None, {"shutter": shutter(RollingShutter)}),
+    "rolling shutter": (by_rows, {"shutter": shutter(RollingShutter), "count": 20}),
     **{name: (None, {"approximations": APPROXIMATIONS[name], **STEP}) for name in OF_LENSES},
 }
 
@@ -357,7 +393,6 @@ CASES = [
         for name in ("unscented", "exact, antialiased", "exact, pixel order")
     ),
 ]
-
 
 SPECIAL_CASES = {thresholds: (adjoint_is_transpose, bytes_are_reproducible)}
 """Functions that make cases to which few laws apply, and these laws: where decisions are taken at

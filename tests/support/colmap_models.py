@@ -103,7 +103,6 @@ def write_text(folder, model, with_points=True):
 
 WRITERS = {"binary": write_binary, "text": write_text}
 
-
 SIZE = 640, 480  # of some_model's cameras
 
 NAMES = ("a.jpg", "b.jpg", "cam/1.png", "cam/2.png")

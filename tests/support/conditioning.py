@@ -58,7 +58,7 @@ def noise(case: Case, cotangents: Cotangents, samples: int = SAMPLES) -> Noise:
             rendered, gradient = _results(gaussians, camera, case, weights)
         images.append(rendered)
         gradients.append(gradient)
-    return Noise(_rms(images, base[0]), _rms(gradients, base[1]))
+    return Noise(rms(images, base[0]), rms(gradients, base[1]))
 
 
 def _results(gaussians, camera, case, cotangents) -> tuple[dict, dict]:
@@ -73,7 +73,7 @@ def _results(gaussians, camera, case, cotangents) -> tuple[dict, dict]:
     return planes, gradients
 
 
-def _rms(samples: list[dict], base: dict) -> dict[str, np.ndarray]:
+def rms(samples: list[dict], base: dict) -> dict[str, np.ndarray]:
     """Over the samples; vectors (colours, rows of a matrix) have one noise, their largest."""
     result = {}
     for name, value in base.items():

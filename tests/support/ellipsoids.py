@@ -177,7 +177,6 @@ MERGED = (
     Merged(own_degree=0, degrees=(0, 0)),
 )
 
-
 ROTATION = Rotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix()
 SCALE, TRANSLATION = 1.5, np.array([0.5, -0.25, 1.0])
 

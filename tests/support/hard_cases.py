@@ -12,19 +12,18 @@ from support.helpers import (
     FLOAT64,
     Case,
     Cotangents,
+    gaussians_before,
+    points_on_film,
     reference_gradients,
     single,
 )
 
 ROUNDINGS = 25
 
-
 BOUND = 6 * np.sqrt(ROUNDINGS)
-
 
 UNDERFLOW = 1e-15
 """Fraction of an array's largest value below which values may be lost to underflow (1e-38)."""
-
 
 PLANES = ("image", "alpha", "depth", "transmittance")
 
@@ -60,17 +59,9 @@ def splats(
     n = len(film)
     z = np.broadcast_to(np.asarray(z, dtype=np.float64), n)
     scales = np.broadcast_to(np.asarray(scales, dtype=np.float64), (n, 3))
-    slopes = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    points = np.column_stack([slopes * z[:, None], z])
     quats = rng.normal(0, 1, (n, 4)) if quats is None else np.broadcast_to(quats, (n, 4))
-    return reference.Gaussians(
-        means=single(points @ camera.rotation + camera.center),
-        quats=single(quats),
-        log_scales=single(np.log(scales)),
-        logit_opacities=single(np.broadcast_to(logits, n)),
-        sh0=single(rng.normal(0, 1, (n, 1, 3))),
-        shN=single(rng.normal(0, sh_size, (n, (degree + 1) ** 2 - 1, 3))),
-    )
+    points, logits = points_on_film(camera, film, z), np.broadcast_to(logits, n)
+    return gaussians_before(rng, camera, points, scales, logits, degree, quats, sh_size)
 
 
 def with_backdrop(rng, camera, gaussians, count=12) -> reference.Gaussians:
@@ -410,7 +401,6 @@ def errors_over_bounds(actual, wanted, bounds, precision, left_out=None) -> dict
 
 SCALES = {FLOAT32: 1.0, FLOAT64: 2 * 2.0**-29}
 """float64 has 2^-29 times the noise; the reference, which is as inexact, doubles it."""
-
 
 EXACT = 1e-11
 """Error of the reference itself, relative to an array's largest value. It evaluates the textbook's

@@ -9,6 +9,7 @@ import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
 import pytest
+from hypothesis import Phase, settings
 
 from drgs.bench import scenes
 from drgs.cameras.camera import Camera
@@ -16,10 +17,9 @@ from drgs.core.arrays import from_host
 from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
-from drgs.splatting import rendering
+from drgs.splatting import rendering, tiles
 from drgs.splatting.footprint import DEFAULT
 from drgs.splatting.projection import compensated_opacity, plain_opacity
-from drgs.splatting.tiles import bin_footprints, footprints_of
 
 NEAR_THRESHOLD = 1e-4
 """Relative distance from a threshold at which float32 may decide otherwise. A mean at p px carries
@@ -64,6 +64,16 @@ both_precisions = pytest.mark.parametrize(
 )
 
 
+examples = settings(
+    derandomize=True,
+    database=None,
+    deadline=None,
+    max_examples=25,
+    phases=[Phase.generate, Phase.shrink],
+)
+"""Settings of Hypothesis: the same examples in every run."""
+
+
 def rows(vectors) -> np.ndarray:
     """(N, D) float64 numpy from a Dr.Jit vector, or (N,) from a flat array."""
     values = np.array(vectors)
@@ -98,19 +108,36 @@ def _random_camera(rng, width, height) -> reference.Camera:
     )
 
 
-def gaussians_on_film(rng, camera, film, z, sizes, logits, degree) -> reference.Gaussians:
-    """Gaussians at film positions (N, 2) px and depths z (N,), of ``sizes`` (N, 3) px."""
-    slopes = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    points = np.column_stack([slopes * z[:, None], z])
-    n = len(z)
+def gaussians_before(
+    rng, camera, points, scales, logits, degree, quats=None, sh_size=0.3
+) -> reference.Gaussians:
+    """Gaussians at points (N, 3) in camera axes, of ``scales`` (N, 3) in scene units.
+
+    quats: (N, 4); None: random ones, of norms from 0.2 to 5.
+    """
+    n = len(points)
+    if quats is None:
+        quats = rng.normal(0, 1, (n, 4)) * rng.uniform(0.2, 5.0, (n, 1))
     return reference.Gaussians(
         means=single(points @ camera.rotation + camera.center),
-        quats=single(rng.normal(0, 1, (n, 4)) * rng.uniform(0.2, 5.0, (n, 1))),
-        log_scales=single(np.log(sizes * np.abs(z)[:, None] / camera.fx)),
+        quats=single(quats),
+        log_scales=single(np.log(scales)),
         logit_opacities=single(logits),
         sh0=single(rng.normal(0, 1.0, (n, 1, 3))),
-        shN=single(rng.normal(0, 0.3, (n, (degree + 1) ** 2 - 1, 3))),
+        shN=single(rng.normal(0, sh_size, (n, (degree + 1) ** 2 - 1, 3))),
     )
+
+
+def points_on_film(camera, film, z) -> np.ndarray:
+    """Points (N, 3) in camera axes that a pinhole shows at ``film`` (N, 2) px, at depths z (N,)."""
+    slopes = (film - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    return np.column_stack([slopes * z[:, None], z])
+
+
+def gaussians_on_film(rng, camera, film, z, sizes, logits, degree) -> reference.Gaussians:
+    """Gaussians at film positions (N, 2) px and depths z (N,), of ``sizes`` (N, 3) px."""
+    scales = sizes * np.abs(z)[:, None] / camera.fx
+    return gaussians_before(rng, camera, points_on_film(camera, film, z), scales, logits, degree)
 
 
 def scattered(rng, camera, degree, count) -> reference.Gaussians:
@@ -243,9 +270,16 @@ def render_composed(gaussians, camera, pipeline):
 
 
 def device_gaussians(gaussians: reference.Gaussians, precision: Precision) -> Gaussians:
-    """The same Gaussians as Dr.Jit tensors."""
+    """The same Gaussians as Dr.Jit arrays, in its own memory: how numpy's is aligned is a part of
+    kernels."""
     fields = {name: getattr(gaussians, name) for name in PARAMETER_NAMES}
-    return Gaussians(**fields).to(precision.TensorXf)
+    device = Gaussians(**fields).to(precision.TensorXf)
+    return replace(device, logit_opacities=precision.array(gaussians.logit_opacities))
+
+
+def host_gaussians(gaussians: reference.Gaussians) -> Gaussians:
+    """In single precision, as files hold them."""
+    return Gaussians(**{n: getattr(gaussians, n).astype(np.float32) for n in PARAMETER_NAMES})
 
 
 def reference_gaussians(gaussians: Gaussians) -> reference.Gaussians:
@@ -285,12 +319,16 @@ def as_images(planes, camera) -> dict[str, np.ndarray]:
     }
 
 
-def image_planes(frame, case) -> dict[str, np.ndarray]:
-    """Return a frame with colour and depth as the fields of ``reference.RenderedImage``."""
-    images = as_images(frame.planes(), case.camera)
+def image_planes(frame, case=None) -> dict[str, np.ndarray]:
+    """Return a frame with colour and depth as the fields of ``reference.RenderedImage``.
+
+    case: on its background; None: on black.
+    """
+    images = as_images(frame.planes(), frame.camera)
     transmittance = images["transmittance"]
+    background = np.zeros(3) if case is None else case.background
     return {
-        "image": images["color"] + transmittance[..., None] * case.background,
+        "image": images["color"] + transmittance[..., None] * background,
         "alpha": 1 - transmittance,
         "depth": images["depth"],
         "transmittance": transmittance,
@@ -420,4 +458,4 @@ def bitwise(tree) -> list[bytes]:
 
 def bin_splats(splats, grid, features=(), model=DEFAULT):
     """From projected splats to tiles, without keys."""
-    return bin_footprints(footprints_of(splats, grid, features, model), grid, model)
+    return tiles.bin_splats(tiles.splat_table(splats, grid, features, model), grid, model)

@@ -13,7 +13,7 @@ from unittest import mock
 
 from drgs.core import registry
 
-EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
 @contextmanager

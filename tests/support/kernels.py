@@ -1,10 +1,9 @@
 """Kernels that were launched: their hashes, their sizes, and whether they add floats atomically."""
 
 import re
-from dataclasses import replace
+from collections.abc import Callable
 
 import drjit as dr
-import drjit.llvm.ad as llvm
 import numpy as np
 
 from drgs.splatting import rendering
@@ -18,37 +17,44 @@ from support.helpers import (
 )
 
 
-def drain_kernels() -> list[list]:
-    """[hash, operation count] of each compiled kernel since the last call."""
-    return [
-        [kernel["hash"], kernel["operation_count"]]
-        for kernel in dr.kernel_history()
-        if kernel["type"] == dr.KernelType.JIT
-    ]
+def launched(act: Callable[[], object]) -> list[dict]:
+    """Run a function; return the entries of Dr.Jit's history for the compiled kernels it runs."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        act()
+        return dr.kernel_history([dr.KernelType.JIT])
 
 
-def kernels_of_a_frame(pipeline, case=None) -> dict[str, list]:
+def kernel_hashes(act: Callable[[], object]) -> set:
+    """Return hashes of the kernels that ``act`` launches."""
+    return {kernel["hash"] for kernel in launched(act)}
+
+
+def kernels_of(act: Callable[[], object]) -> list[list]:
+    """[hash, operation count] of each compiled kernel that ``act`` launches."""
+    return [[kernel["hash"], kernel["operation_count"]] for kernel in launched(act)]
+
+
+def kernels_of_a_frame(pipeline, case=None, camera=None) -> dict[str, list]:
     """Kernels of the forward pass, the adjoint and the tangent of one scene of degree 3."""
     case = case or Case("composition", 37, 29, 3)
     gaussians = device_gaussians(case.gaussians, FLOAT32)
-    camera = device_camera(case.camera, FLOAT32)
-    # A flat array made of a numpy array shares its memory, and whether that is aligned to 64
-    # bytes is up to chance and part of a kernel: let Dr.Jit store it.
-    flat = gaussians.logit_opacities + dr.opaque(llvm.Float, 0)
-    gaussians = replace(gaussians, logit_opacities=flat)
+    camera = camera or device_camera(case.camera, FLOAT32)
     ones = FLOAT32.array(np.ones(case.width * case.height))
     dr.eval(gaussians, camera, ones)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history()
-        frame = rendering.render(gaussians, camera, pipeline)
-        planes = frame.planes()
-        dr.eval(planes)
-        forward = drain_kernels()
-        frame_adjoint(gaussians, frame, [ones] * (len(planes) - 1), ones)
-        adjoint = drain_kernels()
-        dr.eval(frame_tangent(gaussians, frame, gaussians))
-        tangent = drain_kernels()
-    return {"forward": forward, "adjoint": adjoint, "tangent": tangent}
+    frames = []
+
+    def forward():
+        frames.append(rendering.render(gaussians, camera, pipeline))
+        dr.eval(frames[0].planes())
+
+    def adjoint():
+        frame_adjoint(gaussians, frames[0], [ones] * (len(frames[0].planes()) - 1), ones)
+
+    def tangent():
+        dr.eval(frame_tangent(gaussians, frames[0], gaussians))
+
+    return {act.__name__: kernels_of(act) for act in (forward, adjoint, tangent)}
 
 
 FLOAT_REDUCTION = re.compile(r"atomicrmw f\w+|@reduce_\w+_f(?:16|32|64)\w*")
@@ -58,10 +64,6 @@ without atomics serve scatter_add's Expand mode, whose result depends on the thr
 
 def float_reductions(function) -> tuple[list[str], int]:
     """(what FLOAT_REDUCTION finds in the kernels that ``function`` runs, number of kernels)."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history()
-        function()
-        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-    texts = [kernel["ir"].read() for kernel in kernels]
+    texts = [kernel["ir"].read() for kernel in launched(function)]
     assert all("define void @drjit_" in text for text in texts)
     return [found for text in texts for found in FLOAT_REDUCTION.findall(text)], len(texts)

@@ -4,29 +4,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.reference import splatting
 from support.helpers import rows
+from support.reference_lenses import gaussians_at
 from support.views import to_linear
 
-
-def gaussians(means, scale=0.3, opacity=0.9, color=1.0) -> splatting.Gaussians:
-    """Balls of one size and colour."""
-    means = np.atleast_2d(np.asarray(means, np.float32))
-    n = len(means)
-    color = (np.broadcast_to(color, (n, 3)) - 0.5) / splatting.C_00
-    return splatting.Gaussians(
-        means,
-        np.tile([1.0, 0, 0, 0], (n, 1)),
-        np.broadcast_to(np.log(scale), (n, 3)),
-        np.full(n, np.log(opacity / (1 - opacity))),
-        color[:, None],
-        np.zeros((n, 0, 3)),
-    )
-
-
 SETTINGS = (
-    *("light_samples", "exposure", "probes", "unseen", "shadows", "aovs", "smoothing"),
-    *("alpha_max", "alpha_cut"),
+    *("light_samples", "radiance_scale", "probes", "probe_fallback", "shadows"),
+    *("aovs", "smoothing", "alpha_max", "alpha_cut"),
 )
 """Integrator settings accepted by :func:`scene_of`."""
 
@@ -65,7 +49,7 @@ def camera(origin, target, size=24, fov=40, up=(0, 1, 0)):
     }
 
 
-FAR_AWAY = gaussians([[0, 0, 1e4]])
+FAR_AWAY = gaussians_at([[0, 0, 1e4]], 0.3, 0.9, 1.0)
 
 
 def mean_and_error(render, rounds):

@@ -33,7 +33,6 @@ import dataclasses
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import Enum, auto
 from functools import cache
 from types import GeneratorType
 from typing import Any
@@ -293,19 +292,16 @@ def _conjunction(conditions: list[Any]) -> Any:
 
 def _scale(site: Site, part: str, value: Any, names: tuple[str, ...] = ()) -> Any:
     """``names``: of the components of ``value``, where it is unpacked."""
-    kind = _kind(type(value))
-    if kind is _Kind.OTHER:
-        return value
-    if kind in (_Kind.FLAT, _Kind.PACKED):
-        return _scale_array(site, part, value, kind)
-    if kind is _Kind.LIST:
+    if _is_float(value) and not _has_components(value):
+        return _scale_array(site, part, value)
+    if type(value) is list:
         return [_scale(site, part, element) for element in value]
-    if kind is _Kind.DICT:
+    if type(value) is dict:
         return {key: _scale(site, part, element) for key, element in value.items()}
-    if kind is _Kind.DATACLASS:
-        return _scale_fields(site, part, value)
-    named = zip(_names(names, len(value)), value, strict=True)
-    return type(value)([_scale(site, _join(part, name), v) for name, v in named])
+    if type(value) is tuple or _is_float(value):
+        named = zip(_names(names, len(value)), value, strict=True)
+        return type(value)([_scale(site, _join(part, name), v) for name, v in named])
+    return _scale_fields(site, part, value) if dataclasses.is_dataclass(value) else value
 
 
 def _scale_fields(site: Site, part: str, value: Any) -> Any:
@@ -321,11 +317,11 @@ def _scale_fields(site: Site, part: str, value: Any) -> Any:
     return type(value)(**fields)
 
 
-def _scale_array(site: Site, part: str, value: Any, kind: _Kind) -> Any:
+def _scale_array(site: Site, part: str, value: Any) -> Any:
     if dr.width(value) == 0:
         return value
     reason = site.reason or (UNNAMED if part == "_" else "")
-    if kind is _Kind.FLAT and value.state == dr.VarState.Literal:
+    if not dr.is_tensor_v(value) and dr.depth_v(value) == 1 and value.state == dr.VarState.Literal:
         reason = LITERAL_ZERO if value[0] == 0 else reason
     if reason:
         site.left_out[part] = reason
@@ -342,42 +338,21 @@ def _force(site: Site, part: str, condition: Any, changes: tuple[str, ...]) -> A
     return condition
 
 
-class _Kind(Enum):
-    """How a value consists of floating point arrays."""
-
-    FLAT = auto()
-    PACKED = auto()  # a tensor, or any number of components that belong together
-    VECTOR = auto()
-    TUPLE = auto()
-    LIST = auto()
-    DICT = auto()
-    DATACLASS = auto()
-    OTHER = auto()  # it does not
-
-
-@cache
-def _kind(cls: type) -> _Kind:
-    if dr.is_array_v(cls):
-        if not dr.is_float_v(cls):
-            return _Kind.OTHER
-        if dr.is_tensor_v(cls):
-            return _Kind.PACKED
-        if dr.depth_v(cls) == 1:
-            return _Kind.FLAT
-        return _Kind.PACKED if dr.size_v(cls) == dr.Dynamic else _Kind.VECTOR
-    if dataclasses.is_dataclass(cls):
-        return _Kind.DATACLASS
-    return {tuple: _Kind.TUPLE, list: _Kind.LIST, dict: _Kind.DICT}.get(cls, _Kind.OTHER)
-
-
 def _is_float(value: Any) -> bool:
-    return _kind(type(value)) in (_Kind.FLAT, _Kind.PACKED, _Kind.VECTOR)
+    """Whether a value is an array of floating point numbers, of any shape."""
+    return dr.is_array_v(value) and dr.is_float_v(value)
+
+
+def _has_components(value: Any) -> bool:
+    """Whether the parts of an array are values of their own: a vector, but no tensor."""
+    is_tensor = dr.is_tensor_v(value)
+    return not is_tensor and dr.depth_v(value) > 1 and dr.size_v(value) != dr.Dynamic
 
 
 def _has_float(value: Any) -> bool:
     if isinstance(value, (list, tuple)):
         return any(map(_has_float, value))
-    if _kind(type(value)) is _Kind.DATACLASS:
+    if dataclasses.is_dataclass(value):
         return any(_has_float(getattr(value, f.name)) for f in dataclasses.fields(value))
     return _is_float(value)
 

@@ -13,11 +13,10 @@ import tempfile
 from pathlib import Path
 
 import mitsuba as mi
-import numpy as np
 from sybil import Sybil
 from sybil.parsers.markdown import CodeBlockParser, PythonCodeBlockParser, SkipParser
 
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from support.helpers import host_gaussians
 from support.small_capture import make_dataset, write_dataset
 from support.views import Scene
 
@@ -36,9 +35,7 @@ def enter_folder(namespace) -> None:
     folder = Path(tempfile.mkdtemp())
     path = folder / "out" / "lego" / "point_cloud.ply"
     path.parent.mkdir(parents=True)
-    gaussians = Scene(count=20, degree=3).gaussians
-    columns = {name: getattr(gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
-    Gaussians(**columns).save(path)
+    host_gaussians(Scene(count=20, degree=3).gaussians).save(path)
     write_dataset(folder / "scenes" / "lego", make_dataset(train=3, test=1))
     (folder / "scenes" / "lego_mini.yml").write_text(SMALL_FIT)
     os.chdir(folder)

@@ -10,7 +10,7 @@ import numpy as np
 from drgs.core.arrays import types_of
 from drgs.light.walk import RaySplats, Segment
 from drgs.reference import splatting
-from drgs.splatting.cutoffs import Cutoffs
+from drgs.splatting.footprint import Cutoffs
 from drgs.splatting.projection import load_rows
 from support.helpers import device_gaussians
 

@@ -11,7 +11,6 @@ from drgs.reference.splatting import Camera, Gaussians
 
 FISHEYE = Fisheye(-0.03125, 0.015625, -0.0078125, 0.001953125)
 
-
 THIN_PRISM = ThinPrismFisheye(
     -0.03125, 0.015625, -0.0078125, 0.001953125, 0.0078125, -0.00390625, -0.015625, 0.01171875
 )
@@ -27,7 +26,7 @@ def camera_at_origin(**changes) -> Camera:
 
 
 def gaussians_at(
-    means, scales=0.1, opacity=0.5, quats=(1.0, 0.0, 0.0, 0.0), colors=0.5
+    means, scales=0.1, opacity=0.5, colors=0.5, quats=(1.0, 0.0, 0.0, 0.0)
 ) -> Gaussians:
     """Gaussians of degree 0, grey; scales and colors broadcast to (N, 3), opacity to (N,)."""
     means = np.atleast_2d(np.asarray(means, dtype=np.float64))

@@ -9,21 +9,23 @@ import imageio.v3 as iio
 import numpy as np
 import yaml
 
+from drgs.cameras.viewpoints import Viewpoint
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
-from support.helpers import NEAR_THRESHOLD
+from support.helpers import NEAR_THRESHOLD, host_gaussians
 
 WIDTH, HEIGHT = 32, 24
 FIELD_OF_VIEW = 0.7  # radians, horizontal
 RADIUS = 4.0
 FOCUS = np.array([0.25, -0.5, 0.125])
+WHITE = (1.0, 1.0, 1.0)
 
 
 def blobs(count=30, seed=0) -> Gaussians:
     """Opaque and coloured, within a unit of the focus, numpy float32."""
     rng = np.random.default_rng(seed)
-    g = reference.Gaussians(
+    found = reference.Gaussians(
         means=FOCUS + rng.uniform(-0.6, 0.6, (count, 3)),
         quats=rng.normal(size=(count, 4)),
         log_scales=np.log(rng.uniform(0.08, 0.3, (count, 3))),
@@ -31,7 +33,7 @@ def blobs(count=30, seed=0) -> Gaussians:
         sh0=rng.uniform(-1.5, 1.5, (count, 1, 3)),
         shN=rng.normal(0, 0.2, (count, 3, 3)),
     )
-    return Gaussians(**{name: getattr(g, name).astype(np.float32) for name in PARAMETER_NAMES})
+    return host_gaussians(found)
 
 
 def pose_around(azimuth: float, elevation: float, radius=RADIUS) -> np.ndarray:
@@ -51,18 +53,24 @@ def view(name: str, pose: np.ndarray, image: np.ndarray) -> View:
     return View(name, pose, focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, image=image)
 
 
-def photograph(gaussians: Gaussians, camera, background) -> reference.RenderedImage:
-    """Render a View or a Viewpoint by the reference; 0.2: the configuration's near plane."""
-    pose = camera.camera_to_world
-    lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
-    fields = {name: getattr(gaussians, name).astype(np.float64) for name in PARAMETER_NAMES}
-    return reference.render(
-        reference.Gaussians(**fields),
-        reference.Camera(pose[:3, :3].T, pose[:3, 3], *lens, 0.2),
-        np.array(background),
-        gaussians.sh_degree,
-        threshold_width=NEAR_THRESHOLD,
+def double(gaussians: Gaussians) -> reference.Gaussians:
+    """The same numbers for the reference."""
+    return reference.Gaussians(
+        **{name: getattr(gaussians, name).astype(np.float64) for name in PARAMETER_NAMES}
     )
+
+
+def reference_camera(view: View | Viewpoint, near=0.2) -> reference.Camera:
+    """A view's camera for the reference; near: the configuration's."""
+    pose = view.camera_to_world
+    lens = view.fx, view.fy, view.cx, view.cy, view.width, view.height
+    return reference.Camera(pose[:3, :3].T, pose[:3, 3], *lens, near)
+
+
+def photograph(gaussians, view: View | Viewpoint, background=WHITE) -> reference.RenderedImage:
+    """Pixels near a threshold, where float32 may decide otherwise, are marked."""
+    camera, color = reference_camera(view), np.array(background)
+    return reference.render(double(gaussians), camera, color, threshold_width=NEAR_THRESHOLD)
 
 
 def assert_images_agree(image, expected, rendered: reference.RenderedImage, tolerance) -> None:
@@ -91,7 +99,7 @@ def make_dataset(train=8, test=4, seed=0) -> Dataset:
         train=views(train, 0.0),
         test=views(test, 0.3),
         test_split="test",
-        background=(1.0, 1.0, 1.0),
+        background=WHITE,
         start_half_extent=None,
         description="noise <small>",
     )

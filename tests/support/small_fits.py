@@ -15,17 +15,14 @@ from drgs.config.schema import FitConfig
 from drgs.datasets.images import compact_photograph
 from drgs.datasets.types import Dataset, View
 from drgs.effects.base import TrainingEffect
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.images import to_uint8
-from drgs.reference import splatting as reference
 from drgs.results.metrics import ssim
 from drgs.training.trainer import Trainer
 from support import small_capture as capture
-from support.helpers import NEAR_THRESHOLD
+from support.small_capture import WHITE, double, photograph
 from support.viewer_rendering import VIEWER_RENDERING
-
-WHITE = (1.0, 1.0, 1.0)
 
 FROZEN_GAUSSIANS = {
     "optimizer__means_lr": 1e-20,
@@ -41,28 +38,6 @@ CAMERA_RATES = {
     "cameras__focal_lr": 3e-3,
     "cameras__principal_lr": 4e-3,
 }
-
-
-def double(gaussians: Gaussians) -> reference.Gaussians:
-    """The same numbers for the reference."""
-    return reference.Gaussians(
-        **{name: getattr(gaussians, name).astype(np.float64) for name in PARAMETER_NAMES}
-    )
-
-
-def reference_camera(view: View, near=0.2) -> reference.Camera:
-    """A view's camera for the reference; near: the configuration's."""
-    lens = view.fx, view.fy, view.cx, view.cy, view.width, view.height
-    return reference.Camera(view.camera_to_world[:3, :3].T, view.center, *lens, near)
-
-
-def photograph(
-    gaussians: reference.Gaussians, view: View, background=WHITE
-) -> reference.RenderedImage:
-    """Pixels near a threshold, where float32 may decide otherwise, are marked."""
-    return reference.render(
-        gaussians, reference_camera(view), np.array(background), threshold_width=NEAR_THRESHOLD
-    )
 
 
 def photometric_loss(image, target, weight=0.2) -> float:
@@ -224,14 +199,6 @@ def assert_resumes_to_the_same_bytes(make: Callable[[], Trainer], before: int, a
     assert not differ
     begun = everything_of(interrupted)
     assert any(begun[name] != value for name, value in expected.items())
-
-
-def kernel_hashes(act: Callable[[], object]) -> set:
-    """Return hashes of the kernels that ``act`` launches."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        act()
-        return {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
 
 
 def end_view(effect: TrainingEffect, trainer: Trainer, view) -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 
 import drgs  # noqa: F401  (registers the plugin)
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from support.helpers import assert_arrays_agree
+from drgs.gaussians.parameters import PARAMETER_NAMES
+from support.helpers import assert_arrays_agree, host_gaussians
 from support.views import image_of
 
 # Relative to the largest value of an array, in single precision: test_rendering derives 2e-5 and
@@ -40,8 +40,7 @@ def fresh_image(scene, **film):
 
 
 def write_gaussians(path, gaussians) -> str:
-    fields = {name: getattr(gaussians, name).astype(np.float32) for name in PARAMETER_NAMES}
-    Gaussians(**fields).save(path)
+    host_gaussians(gaussians).save(path)
     return str(path)
 
 

@@ -31,7 +31,7 @@ def pose(axis, degrees, position=(0.0, 0.0, 0.0), mirrored=False) -> tuple:
 
 @dataclass(frozen=True)
 class View:
-    """A ``perspective`` sensor: its dictionary, and its camera by the manual's definitions."""
+    """A sensor: its dictionary, and the camera of a ``perspective`` one by the manual."""
 
     name: str
     width: int = 37
@@ -43,6 +43,7 @@ class View:
     crop: tuple[int, int, int, int] | None = None  # x, y, width, height
     near_clip: float = 0.01
     to_world: tuple = pose([0.3, -1.0, 0.5], 40, (0.4, -0.7, 1.1))
+    others: tuple = ()  # (name, value) of a sensor of another type; a function returns its value
 
     @property
     def camera(self) -> reference.Camera:
@@ -87,11 +88,14 @@ class View:
         fov = {"fov": self.fov, "fov_axis": self.fov_axis}
         if self.focal_length is not None:
             fov = {"focal_length": f"{self.focal_length}mm"}
-        return {
+        own = {
             "type": "perspective",
             **fov,
             "principal_point_offset_x": self.offset[0],
             "principal_point_offset_y": self.offset[1],
+        }
+        others = {name: value() if callable(value) else value for name, value in self.others}
+        return {
             "near_clip": self.near_clip,
             "to_world": mi.ScalarTransform4f(np.array(self.to_world)),
             "film": {
@@ -104,13 +108,12 @@ class View:
                 **film,
             },
             "sampler": {"type": sampler, "sample_count": samples},
+            **(others or own),
         }
 
-    def sensor_like(self, kind: str, **parameters) -> dict:
+    def with_sensor(self, kind: str, **parameters) -> View:
         """A sensor of another type at the same place, with the same film."""
-        sensor = self.sensor()
-        kept = {key: sensor[key] for key in ("to_world", "film", "sampler", "near_clip")}
-        return kept | {"type": kind, **parameters}
+        return replace(self, others=(("type", kind), *parameters.items()))
 
 
 VIEWS = (
@@ -130,6 +133,14 @@ VIEWS = (
     View("crop window, principal point", 41, 53, crop=(3, 21, 22, 31), offset=(0.125, 0.0625)),
 )
 """Wide, tall and cropped films that no 16x16 tile divides."""
+
+
+def side_by_side(*views: View, **film) -> dict:
+    """A ``batch`` of views of one size; film: see ``View.sensor``."""
+    whole = views[0].sensor(**film)
+    whole["film"]["width"] *= len(views)
+    children = {f"view_{k}": view.sensor() for k, view in enumerate(views)}
+    return {"type": "batch", "film": whole["film"], "sampler": whole["sampler"], **children}
 
 
 # ----------------------------------------------------------------------------------------------

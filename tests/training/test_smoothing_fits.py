@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support import small_fits as fits
 from support.fit_command import assert_fits, without_images, write_scene
+from support.small_capture import reference_camera
 from support.smoothing import smoothed_reference
 from support.viewer_rendering import VIEWER_RENDERING
 
@@ -19,7 +20,7 @@ def make_trainer(**changes):
 
 
 def expected_filter(means) -> np.ndarray:
-    cameras = [fits.reference_camera(view) for view in fits.plain_dataset().train]
+    cameras = [reference_camera(view) for view in fits.plain_dataset().train]
     rates = reference_effects.sampling_rates(np.asarray(means, np.float64), cameras)
     return np.sqrt(0.2) / rates
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import small_fits as fits
 from support.helpers import single
-from support.small_capture import HEIGHT, WIDTH
+from support.small_capture import HEIGHT, WIDTH, reference_camera
 from support.small_fits import mask_of, photometric_loss
 
 from drgs.core.errors import UserError
@@ -130,7 +130,7 @@ def test_gradient_of_the_depth_penalty_equals_differences_of_the_reference():
     dr.backward(penalty)
 
     def value(gaussians) -> float:
-        image = reference.render(gaussians, fits.reference_camera(photo))
+        image = reference.render(gaussians, reference_camera(photo))
         return penalty_in_numpy(image.depth, image.alpha, photo)
 
     rng = np.random.default_rng(2)

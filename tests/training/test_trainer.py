@@ -6,7 +6,8 @@ Prepared targets stay on the device while there is room, else they are prepared 
 import numpy as np
 import pytest
 from support import small_fits as fits
-from support.small_fits import kernel_hashes, steps
+from support.kernels import kernel_hashes
+from support.small_fits import steps
 from support.trainers import make_trainer
 
 from drgs.training import steps as steps_module

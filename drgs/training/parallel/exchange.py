@@ -34,24 +34,28 @@ from drgs.core.constants import MAX_SHUTTER_SAMPLES
 from drgs.core.types import Array2f, Bool, Float, UInt32
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.sensor_render import accumulate_in_sensor, attached_cameras
-from drgs.integrator.sensors import camera_from_sensor, read_sensor
+from drgs.integrator.sensors import (
+    accumulate_in_sensor,
+    attached_cameras,
+    camera_from_sensor,
+    read_sensor,
+)
 from drgs.integrator.types import SplatsPlugin
 from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (
     NO_FAULT,
     CameraGradients,
+    DirectProjection,
     Frame,
     GaussianGradients,
     Pipeline,
-    Projected,
     gradients_by_row,
-    project_footprints,
+    project_splats,
     sum_of_gradients,
     sum_of_views,
     weighted_sums,
 )
-from drgs.splatting.tiles import Footprints
+from drgs.splatting.tiles import SplatTable
 from drgs.training.parallel.communicator import Communicator, wait
 from drgs.training.parallel.population import renderer_of
 from drgs.training.steps import StepView, ViewGradients, ViewLoss
@@ -63,7 +67,7 @@ VIEWS_AT_ONCE = 4
 Blocks = list[np.ndarray]
 """Rows of numbers as they travel: (M, columns) for each block of :class:`drgs.core.arrays.Rows`."""
 
-BOX_NUMBERS = 4  # numbers of a splat's box of tiles: see :class:`drgs.splatting.tiles.Footprints`
+BOX_NUMBERS = 4  # numbers of a splat's box of tiles: see :class:`drgs.splatting.tiles.SplatTable`
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,18 +97,18 @@ class LocalProjection:
         """Columns of the blocks of a splat: its box, its stored numbers, its depth."""
         return (BOX_NUMBERS, *block_widths(self.num_stored), 1)
 
-    def footprints(self, blocks: Blocks) -> Footprints:
+    def table(self, blocks: Blocks) -> SplatTable:
         """Return received splats without copying them."""
         box, *stored, depths = (wrap_numpy(self.boxes.Float, block) for block in blocks)
         rows, boxes = Rows(tuple(stored), self.num_stored), Rows((box,), BOX_NUMBERS)
-        return Footprints(boxes, rows, depths, self.num_features, self.num_keys)
+        return SplatTable(boxes, rows, depths, self.num_features, self.num_keys)
 
     def gradients(self, columns: list[Float]) -> SplatGradients:
         """Divide columns of derivatives into those of geometry and of features."""
         num_geometry = len(columns) - self.num_features
         return SplatGradients(columns[:num_geometry], columns[num_geometry:])
 
-    def pack(self, splats: Footprints, rows: UInt32) -> Blocks:
+    def pack(self, splats: SplatTable, rows: UInt32) -> Blocks:
         """Return the projected splats of some rows of this rank, (M,), on the host."""
         count, float_type = dr.width(rows), splats.rows.Float
         if count == 0:
@@ -133,7 +137,7 @@ def _empty_blocks(count: int, widths: Sequence[int], float_type: type) -> Blocks
     return [empty_on_host(float_type, (count, width)) for width in widths]
 
 
-def _concatenate(parts: Sequence[Footprints]) -> Footprints:
+def _concatenate(parts: Sequence[SplatTable]) -> SplatTable:
     """Return the splats of several ranks behind one another."""
     if len(parts) == 1:
         return parts[0]
@@ -144,7 +148,7 @@ def _concatenate(parts: Sequence[Footprints]) -> Footprints:
 
     boxes, rows = (concatenate([getattr(p, name) for p in parts]) for name in ("boxes", "rows"))
     depths = dr.concat([part.depths for part in parts])
-    return Footprints(boxes, rows, depths, parts[0].num_features, parts[0].num_keys)
+    return SplatTable(boxes, rows, depths, parts[0].num_features, parts[0].num_keys)
 
 
 @dataclass(eq=False)
@@ -271,15 +275,15 @@ class ViewExchange:
         renderer = self._views[view.place].renderer
         return type(value)(self.comm.broadcast(np.array(value, np.float32), renderer))
 
-    def footprints(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Footprints:
+    def project(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
         """Return the splats of all ranks, behind one another, as ``camera`` sees them.
 
         Between two steps, of this rank only.
         """
         if (each := self._current) is None:
-            return project_footprints(gaussians, camera, pipeline)
+            return project_splats(gaussians, camera, pipeline)
         time = len(each.local)
-        own = project_footprints(gaussians, camera, pipeline)
+        own = project_splats(gaussians, camera, pipeline)
         counts = own.rows.width, own.num_features, own.num_keys
         local = LocalProjection(camera, pipeline, own.boxes, *counts)
         each.local.append(local)
@@ -290,20 +294,24 @@ class ViewExchange:
             elif (count := int(each.counts[rank, time])) > 0:
                 blocks = _empty_blocks(count, local.widths, own.rows.Float)
                 self._receive(blocks, rank, each, time)
-                parts.append(local.footprints(blocks))
+                parts.append(local.table(blocks))
         return _concatenate(parts)
 
     def gradients(
-        self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, of_camera: bool
+        self,
+        gaussians: Gaussians,
+        frame: Frame,
+        of_splats: SplatGradients,
+        with_camera: bool,
     ) -> GaussianGradients:
         """Return derivatives with respect to splats to the ranks that have projected them."""
         if (each := self._current) is None:
-            return Projected().gradients(gaussians, frame, of_splats, of_camera)
+            return DirectProjection().gradients(gaussians, frame, of_splats, with_camera)
         time = len(each.gradients)
         columns = self._divide(each, time, [*of_splats.geometry, *of_splats.features])
         each.gradients.append(each.local[time].gradients(columns))
         each.frames.append(frame)
-        each.needs_camera = of_camera
+        each.needs_camera = with_camera
         t = types_of(type(of_splats.opacities))
         return GaussianGradients(None, dr.zeros(t.Array2f), t.Bool(False), t.UInt32(NO_FAULT))
 
@@ -323,10 +331,10 @@ class ViewExchange:
         with dr.suspend_grad():
             gaussians, pipeline = dr.detach(self.integrator.gaussians), self.integrator.pipeline
             for camera in cameras:
-                of_camera = with_effects(pipeline, gaussians, camera)
-                splats = project_footprints(gaussians, camera, of_camera)
+                composed = with_effects(pipeline, gaussians, camera)
+                splats = project_splats(gaussians, camera, composed)
                 counts = splats.rows.width, splats.num_features, splats.num_keys
-                local = LocalProjection(camera, of_camera, splats.boxes, *counts)
+                local = LocalProjection(camera, composed, splats.boxes, *counts)
                 rows = cast(UInt32, dr.compress(local.visible))
                 each.local.append(local)
                 each.rows.append(rows)
@@ -427,7 +435,7 @@ class ViewExchange:
             gaussians, found, of_cameras = dr.detach(self.integrator.gaussians), [], []
             for local, gradients in zip(each.local, each.gradients, strict=True):
                 seen = local.camera, local.pipeline, gradients
-                of_view, of_rows = gradients_by_row(gaussians, *seen, of_camera=True)
+                of_view, of_rows = gradients_by_row(gaussians, *seen, with_camera=True)
                 found.append(of_view)
                 rows = np.stack([np.array(column) for column in of_rows], axis=1)
                 rows = self.comm.gather_rows(rows, each.renderer)

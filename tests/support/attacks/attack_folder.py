@@ -21,7 +21,6 @@ from unittest.mock import patch
 import imageio.v3 as iio
 import numpy as np
 import yaml
-from plyfile import PlyData, PlyElement
 
 from drgs.capture import __main__ as capture
 from drgs.core.files import atomic_path
@@ -29,15 +28,9 @@ from drgs.fit import __main__ as fit
 from drgs.results.files import CHECKPOINT, CURVES, ORBIT, REPORT, VIEWER
 from support.attacks.attack import Fault, observed
 from support.commands import assert_ends_well, run_in_process
+from support.datasets import write_points
 from support.ksplat import content_of
-from support.small_capture import (
-    HEIGHT,
-    WIDTH,
-    blobs,
-    make_dataset,
-    pose_around,
-    write_dataset,
-)
+from support.small_capture import HEIGHT, WIDTH, blobs, make_dataset, pose_around, write_dataset
 
 SETTINGS = {
     "data": {"path": "lego"},
@@ -109,21 +102,12 @@ def write_photos(folder: Path) -> None:
     (folder / "transforms.json").write_text(json.dumps(meta))
 
 
-def write_points(path: Path) -> None:
-    """A cloud of coloured points."""
-    rng = np.random.default_rng(0)
-    rows = np.zeros(12, "f4, f4, f4, u1, u1, u1")
-    rows.dtype.names = ("x", "y", "z", "red", "green", "blue")
-    for name in rows.dtype.names:
-        rows[name] = rng.uniform(-1, 1, 12) if name in "xyz" else rng.integers(0, 256, 12)
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
-
-
 def write_inputs(folder: Path) -> None:
     """Everything but what the commands write themselves."""
     write_dataset(folder / "lego", make_dataset(train=3, test=1))
     write_photos(folder / "photos")
-    write_points(folder / "points.ply")
+    positions, colors = np.random.default_rng(0).uniform(-1, 1, (12, 3)), _noise(6, 3)[0, :12]
+    write_points(folder / "points.ply", positions, colors)
     for suffix in (".ply", ".compressed.ply", ".spz", ".glb", ".sog"):
         blobs(12).save(folder / f"gaussians{suffix}")
     replace(blobs(12), shN=np.zeros((12, 0, 3), np.float32)).save(folder / "gaussians.splat")

@@ -15,12 +15,7 @@ from support.attacks.attack_folder import CAPTURE, AttackFolder, current_folder
 from support.attacks.files import damage_attacks, other_file_attacks, special_attacks
 from support.attacks.options import combination_attacks, drawn_attacks, folder_attacks, name_attacks
 from support.attacks.trial import run
-from support.attacks.values import (
-    object_attacks,
-    option_attacks,
-    property_attacks,
-    schema_attacks,
-)
+from support.attacks.values import object_attacks, option_attacks, property_attacks, schema_attacks
 
 FITTED = "point_cloud.ply renders/test/r_0.png side_by_side/test/r_0.png config.yml"
 

@@ -44,13 +44,10 @@ READERS = {
     "photos/mask.png": PHOTOS,
     "photos/depth.npy": PHOTOS,
     "photos/depth.png": PHOTOS,
-    "gaussians.ply": ("render", "gaussians.ply", *CAMERA),
-    "gaussians.compressed.ply": ("render", "gaussians.compressed.ply", *CAMERA),
-    "gaussians.spz": ("render", "gaussians.spz", *CAMERA),
-    "gaussians.glb": ("render", "gaussians.glb", *CAMERA),
-    "gaussians.sog": ("render", "gaussians.sog", *CAMERA),
-    "gaussians.ksplat": ("render", "gaussians.ksplat", *CAMERA),
-    "gaussians.splat": ("render", "gaussians.splat", *CAMERA),
+    **{
+        f"gaussians.{kind}": ("render", f"gaussians.{kind}", *CAMERA)
+        for kind in ("ply", "compressed.ply", "spz", "glb", "sog", "ksplat", "splat")
+    },
     "camera.json": ("render", "gaussians.ply", "--camera", "camera.json", "--out", "out"),
     "sky.png": ("render", "gaussians.ply", *CAMERA, "--background", "sky.png"),
     "run/config.yml": RUN,

@@ -7,8 +7,8 @@ import pytest
 from drjit.llvm.ad import Float, TensorXf, TensorXf64
 from hypothesis import given
 from hypothesis import strategies as st
+from support.helpers import examples
 from support.populations import make, rows_of, values
-from support.random_scenes import examples
 from support.trainers import make_trainer
 
 from drgs.config.density import DensifyConfig

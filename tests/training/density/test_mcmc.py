@@ -10,8 +10,8 @@ from drjit.llvm.ad import Float, Float64, TensorXf64, UInt32
 from scipy import stats
 from scipy.integrate import quad
 from scipy.special import expit
+from support.kernels import kernel_hashes
 from support.populations import EXTENT, assert_standard_normal, make, moments, rows_of, values
-from support.small_fits import kernel_hashes
 
 from drgs.config.density import DensifyConfig
 from drgs.core.errors import UserError

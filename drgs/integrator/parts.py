@@ -1,4 +1,4 @@
-"""Gaussians of an image, gathered from splat objects and shapes.
+"""Gaussians of an image from several parts: splat objects and shapes.
 
 Imported when a scene has more than the unmoved Gaussians of one integrator. Each :class:`Part`
 converts stored Gaussians to raw parameters in world space; Dr.Jit differentiates the conversions.
@@ -50,7 +50,7 @@ from drgs.core.arrays import from_host, interleave, tangent_of, types_of
 from drgs.core.errors import PluginError
 from drgs.core.private import same_variables
 from drgs.core.types import Float, Matrix4f
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.rotation import (
     left_multiplication_matrix,
     sh_rotation_generators,
@@ -90,15 +90,15 @@ class Part(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class GatheredGaussians:
-    """Gathered Gaussians and their parts."""
+class CombinedParts:
+    """Parts, and the Gaussians of all."""
 
     parts: list[Part]  # detached
     sizes: list[tuple[int, int]]  # by part: number of Gaussians, degree
     gaussians: Gaussians  # detached and evaluated
 
     def matches(self, parts: Sequence[Part]) -> bool:
-        """Return whether gathering ``parts`` would give the same Gaussians."""
+        """Return whether ``parts`` would give the same Gaussians."""
         return same_variables(
             [part.values for part in self.parts], [part.values for part in parts]
         ) and [part.fixed_inputs for part in self.parts] == [part.fixed_inputs for part in parts]
@@ -111,8 +111,8 @@ class GatheredGaussians:
             if attached and num > 0:
                 copy = own.detach()
                 dr.enable_grad([copy.values[name] for name in attached])
-                rows = _arrays(_rows(gradients, start, num, degree))
-                found = _arrays(copy.gaussians())
+                rows = _rows(gradients, start, num, degree).arrays
+                found = copy.gaussians().arrays
                 outputs = {k: v for k, v in found.items() if k in rows and dr.grad_enabled(v)}
                 for name, values in outputs.items():
                     dr.accum_grad(values, rows[name])
@@ -132,11 +132,11 @@ class GatheredGaussians:
                 dr.set_grad(copy.values[name], tangent_of(values))
             moved = copy.gaussians()
             dr.forward_to(moved)
-            found.append(_gaussians({k: tangent_of(v) for k, v in _arrays(moved).items()}))
+            found.append(Gaussians.from_arrays({k: tangent_of(v) for k, v in moved.arrays.items()}))
         return _concatenate(found, self.gaussians.sh_degree)
 
 
-def gather(parts: Sequence[Part], last: GatheredGaussians | None) -> GatheredGaussians:
+def combine(parts: Sequence[Part], last: CombinedParts | None) -> CombinedParts:
     """Return the Gaussians of all parts, in order and of the highest degree.
 
     last: the last result, returned again while nothing has changed. Features, coefficients and
@@ -149,11 +149,11 @@ def gather(parts: Sequence[Part], last: GatheredGaussians | None) -> GatheredGau
     sizes = [(part.num_gaussians, part.sh_degree) for part in converted]
     gaussians = _concatenate(converted, max(degree for _, degree in sizes))
     dr.eval(gaussians)
-    return GatheredGaussians(parts, sizes, gaussians)
+    return CombinedParts(parts, sizes, gaussians)
 
 
 def _concatenate(parts: Sequence[Gaussians], degree: int) -> Gaussians:
-    found = [(part.num_gaussians, _arrays(part)) for part in parts if part.num_gaussians > 0]
+    found = [(part.num_gaussians, part.arrays) for part in parts if part.num_gaussians > 0]
     shapes = {k: v.shape[1:] for _, arrays in found for k, v in arrays.items()}
     shapes["shN"] = _sh_shape(degree)
     whole = {}
@@ -162,16 +162,16 @@ def _concatenate(parts: Sequence[Gaussians], degree: int) -> Gaussians:
         filled = [block for block in blocks if dr.width(block) > 0]  # dr.concat takes no others
         flat = dr.concat(filled) if len(filled) > 1 else (filled or blocks)[0]
         whole[name] = _reshape(flat, sum(num for num, _ in found), row)
-    return _gaussians(whole)
+    return Gaussians.from_arrays(whole)
 
 
 def _rows(gaussians: Gaussians, start: int, num: int, degree: int) -> Gaussians:
     """Return ``num`` rows from row ``start`` on, with the coefficients of ``degree``."""
-    arrays = _arrays(gaussians)
+    arrays = gaussians.arrays
     shapes = {k: v.shape[1:] for k, v in arrays.items()} | {"shN": _sh_shape(degree)}
     total = gaussians.num_gaussians
     blocks = {k: _block(v, start, num, total, shapes[k]) for k, v in arrays.items()}
-    return _gaussians({k: _reshape(v, num, shapes[k]) for k, v in blocks.items()})
+    return Gaussians.from_arrays({k: _reshape(v, num, shapes[k]) for k, v in blocks.items()})
 
 
 def _sh_shape(degree: int) -> tuple[int, int]:
@@ -180,17 +180,6 @@ def _sh_shape(degree: int) -> tuple[int, int]:
 
 def _reshape(flat: Float, num: int, row: tuple[int, ...]) -> mi.TensorXf | Float:
     return mi.TensorXf(flat, (num, *row)) if row else flat
-
-
-def _arrays(part: Gaussians) -> ParameterArrays:
-    named = {name: getattr(part, name) for name in (*PARAMETER_NAMES, "smoothing")}
-    return {k: v for k, v in {**named, **(part.features or {})}.items() if v is not None}
-
-
-def _gaussians(arrays: ParameterArrays) -> Gaussians:
-    features = {k: v for k, v in arrays.items() if k not in (*PARAMETER_NAMES, "smoothing")}
-    own = {k: v for k, v in arrays.items() if k not in features}
-    return Gaussians(**own, features=features or None)
 
 
 def _block(
@@ -287,14 +276,14 @@ class Placement:
     @staticmethod
     def from_matrix(gaussians: Gaussians, to_world: Matrix4f, name: str) -> Placement:
         """Place Gaussians by one matrix; name: of the parameter."""
-        return Placement({**_arrays(gaussians), TO_WORLD: to_world}, name)
+        return Placement({**gaussians.arrays, TO_WORLD: to_world}, name)
 
     def gaussians(self) -> Gaussians:
         """Return all parameters; PluginError where they leave float32."""
         arrays = {name: values for name, values in self.values.items() if name != TO_WORLD}
         if dr.grad_enabled(self.values[TO_WORLD]) or not self._place.is_identity:
             arrays |= self._transform_arrays(arrays)
-        return _gaussians(arrays)
+        return Gaussians.from_arrays(arrays)
 
     @cached_property
     def _place(self) -> Similarity:
@@ -462,13 +451,16 @@ class Conversion:
         return dr.select(inside, dr.replace_grad(clamped, value), clamped)
 
 
-def conversions_of(shapes: Sequence[mi.Shape], turns: Mapping[str, ShRotation]) -> list[Conversion]:
-    """Read shapes, attached; turns: by their ids, "": of all other shapes."""
-    unknown = set(turns) - {shape.id() for shape in shapes} - {""}
+def conversions_of(
+    shapes: Sequence[mi.Shape], rotations: Mapping[str, ShRotation]
+) -> list[Conversion]:
+    """Read shapes, attached; rotations: by their ids, "": of all other shapes."""
+    unknown = set(rotations) - {shape.id() for shape in shapes} - {""}
     if unknown:
         found = ", ".join(f"'{shape.id()}'" for shape in shapes if shape.id()) or "none"
         raise PluginError(
             f"splats: shapes_to_world_{min(unknown)} must end with the id of a shape of type "
             f"ellipsoids or ellipsoidsmesh, ids are: {found}"
         )
-    return [Conversion(read(shape), turns.get(shape.id(), turns.get(""))) for shape in shapes]
+    others = rotations.get("")
+    return [Conversion(read(shape), rotations.get(shape.id(), others)) for shape in shapes]

@@ -1,14 +1,15 @@
 """Many features, composited in groups, against as many images of few."""
 
-import drjit as dr
+from functools import partial
+
 import numpy as np
 import pytest
 from support.helpers import Case, clear
-from support.kernels import drain_kernels
+from support.kernels import kernels_of
 
 import drgs
 from drgs.reference import splatting as reference
-from drgs.splatting.feature_groups import FEATURES_AT_ONCE
+from drgs.splatting.order import FEATURES_AT_ONCE
 
 CASE = clear(Case("feature groups", 37, 29, 0, seed=3))
 NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
@@ -45,8 +46,6 @@ def test_groups_share_their_kernels():
     found = []
     for groups in (2, 3):
         given = arrays(np.float64, groups * FEATURES_AT_ONCE[8])
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history()
-            drgs.rasterization(**given, **FILM)
-            found.append(max(drain_kernels(), key=lambda kernel: kernel[1]))
+        kernels = kernels_of(partial(drgs.rasterization, **given, **FILM))
+        found.append(max(kernels, key=lambda kernel: kernel[1]))
     assert found[0] == found[1]

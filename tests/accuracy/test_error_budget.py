@@ -14,6 +14,7 @@ from support.render_command import run, sensor, write_scene
 from support.small_capture import pose_around
 from support.views import Scene, tensors
 
+from drgs.accuracy import error_budget as budgets
 from drgs.bench.scenes import device_camera, stress_scene
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.cameras.lens import LENSES
@@ -21,7 +22,7 @@ from drgs.config.approximations import FALLOFFS, Approximations, parse_error
 from drgs.core.errors import PluginError
 from drgs.core.registry import temporary_registrations
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.integrator import error_budget as budgets
+from drgs.integrator.error_budget import renderer_of
 from drgs.integrator.scene import film_description
 from drgs.io.scenes import openexr_threads
 from drgs.reference import rays as reference_rays
@@ -48,7 +49,7 @@ def scene():
 def search(scene, given=SHIPPED):
     gaussians, cameras = scene
     on_device = [device_camera(camera, llvm.Float) for camera in cameras[::2]]
-    renderer = budgets.Renderer(gaussians.to(llvm.TensorXf), given, 3, BLACK)
+    renderer = renderer_of(gaussians.to(llvm.TensorXf), given, 3, BLACK)
     return budgets.Search(renderer, on_device)
 
 
@@ -58,7 +59,7 @@ def found(scene):
 
 
 def image(scene, camera, approximations):
-    renderer = budgets.Renderer(scene[0].to(llvm.TensorXf), approximations, 3, BLACK)
+    renderer = renderer_of(scene[0].to(llvm.TensorXf), approximations, 3, BLACK)
     return renderer.image(device_camera(camera, llvm.Float))
 
 
@@ -110,7 +111,7 @@ def test_filters_and_other_settings_are_kept(scene):
 def test_windows_show_a_part_of_the_image(scene):
     gaussians, (camera, *_) = scene
     lens = LENSES.get("opencv").value.from_coefficients(k1=0.1, k2=0.01, p1=0.0, p2=0.0)
-    renderer = budgets.Renderer(gaussians.to(llvm.TensorXf), Approximations(), 3, (1, 0.5, 0))
+    renderer = renderer_of(gaussians.to(llvm.TensorXf), Approximations(), 3, (1, 0.5, 0))
     whole = device_camera(camera, llvm.Float).with_lens(lens)
     # Tolerance: that of single precision, as in the documents.
     part = renderer.image(budgets.crop(whole, 12, 7, 20, 16))

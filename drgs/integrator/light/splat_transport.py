@@ -3,10 +3,11 @@
 Splats have display-encoded colours: a ray's composited colour C with transmittance T is the colour
 C / (1 - T) with the coverage 1 - T. Its radiance is
 
-    exposure (1 - T) lin(C / (1 - T)),
+    s (1 - T) lin(C / (1 - T)),
 
 so that opaque splats look the same in a mirror, and a white fog before a white wall stays white.
-Where a ray leaves a scene that has no environment, black is the last splat: exposure lin(C).
+with s the ``radiance_scale``. Where a ray leaves a scene that has no environment, black is the last
+splat: s lin(C).
 
 By default, n splats are drawn with their weights instead of compositing all. Their colours c
 estimate the powers of C / (1 - T), without bias: from the sums s_k of c^k,
@@ -21,7 +22,7 @@ For rays that meet black at last, a draw is black with the probability T.
 :class:`ProbeTransport` looks segments up in probes (:mod:`drgs.light.probe`) in the middle of
 shapes and emitters: rays that start at the object, and for their transmittance, rays from shapes
 without a probe to an emitter with one. All other rays pass no splats. A ray that a probe has no
-answer for meets nothing or, with ``unseen``, is traced by :class:`RayTransport`.
+answer for meets nothing or, with ``probe_fallback``, is traced by :class:`RayTransport`.
 """
 
 from __future__ import annotations
@@ -41,9 +42,8 @@ from drgs.config.approximations import Approximations
 from drgs.core.arrays import reinterpret
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.checks import check_ids
-from drgs.integrator.rays import PathSegment, SplatTransport, TransportIntegrator
-from drgs.integrator.sensor_render import decode
+from drgs.integrator.film import decode
+from drgs.integrator.light.rays import PathSegment, SplatTransport, TransportIntegrator
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import SplatsState
 from drgs.light.probe import CUBE_SIZE_TEXELS, LOW_PASS, NUM_LEVELS, ProbeHit, Probes
@@ -52,7 +52,7 @@ from drgs.splatting.projection import load_rows
 from drgs.splatting.rendering import color_features, depth_feature
 
 if TYPE_CHECKING:
-    from drgs.integrator.mirrors import FlatMirror, Mirrors
+    from drgs.integrator.light.mirrors import FlatMirror, Mirrors
 else:  # Dr.Jit evaluates annotations
     Mirrors = object
 
@@ -70,7 +70,7 @@ class RayTransport(SplatTransport):
     """Transport along rays that pass the splats themselves."""
 
     splats: RaySplats
-    exposure: mi.Float  # (1,): factor of the splats' radiance
+    radiance_scale: mi.Float  # (1,): factor of the splats' radiance
     num_samples: int  # drawn splats; 0: all are composited
 
     @staticmethod
@@ -81,8 +81,8 @@ class RayTransport(SplatTransport):
         found = splats.cache.find(
             "ray splats", settings, gaussians, lambda: ray_splats_of(gaussians, *settings)
         )
-        exposure = dr.opaque(mi.Float, splats.exposure)
-        return RayTransport(found.value, exposure, splats.light_samples)
+        scale = dr.opaque(mi.Float, splats.lighting.radiance_scale)
+        return RayTransport(found.value, scale, splats.lighting.light_samples)
 
     @override
     def composite_segment(
@@ -93,7 +93,8 @@ class RayTransport(SplatTransport):
             color, coverage = self._composite_sampled(ray, segment.is_open, sample)
         else:
             color, coverage = self._composite_all(ray, segment.is_open)
-        return dr.select(active, self.exposure * color, 0), dr.select(active, 1 - coverage, 1)
+        radiance = dr.select(active, self.radiance_scale * color, 0)
+        return radiance, dr.select(active, 1 - coverage, 1)
 
     def _composite_all(self, segment: Segment, is_open: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
         color, T = self.splats.composite_segment(segment)
@@ -149,12 +150,10 @@ def nested_with_transport(
         settings = {"type": "splatpath", "hide_emitters": splats.hide_emitters}
         nested = mi.load_dict(settings)
     assert isinstance(nested, TransportIntegrator), "checked with the settings"
-    if splats.light == "rays":
+    if splats.lighting.light == "rays":
         nested.use_transport(RayTransport.from_splats(splats))
     else:
-        traces = splats.unseen == "rays"
-        unseen = RayTransport.from_splats(splats) if traces else None
-        nested.use_transport(ProbeTransport.from_splats(splats, scene, num_paths, sensors, unseen))
+        nested.use_transport(ProbeTransport.from_splats(splats, scene, num_paths, sensors))
     return nested
 
 
@@ -172,12 +171,12 @@ class ProbeTransport(SplatTransport):
 
     probes: Probes
     mirrors: Mirrors | None  # images of flat mirrors; None: there are none
-    exposure: mi.Float  # (1,): factor of the splats' radiance
+    radiance_scale: mi.Float  # (1,): factor of the splats' radiance
     shapes: dict[int, mi.ShapePtr]  # by number of their probe
     emitters: dict[int, mi.EmitterPtr]  # by number of their probe
     flat: dict[int, int]  # numbers of mirrors, by number of their probe
     num_paths: mi.Float  # (1,): per pixel
-    unseen: SplatTransport | None  # for rays that probes have no answer for
+    fallback: SplatTransport | None  # for rays that probes have no answer for
 
     @staticmethod
     def from_splats(
@@ -185,10 +184,9 @@ class ProbeTransport(SplatTransport):
         scene: mi.Scene,
         num_paths: int,
         sensors: Sequence[mi.Sensor],
-        unseen: SplatTransport | None,
     ) -> ProbeTransport:
         """Return the transport by probes; sensors: of flat mirrors. PluginError for unknown ids."""
-        objects = _objects(scene, splats.probes)
+        objects = _objects(scene, splats.lighting.probes)
         shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
         states = [read_sensor(sensor, splats.near).detach() for sensor in sensors]
@@ -197,12 +195,12 @@ class ProbeTransport(SplatTransport):
         return ProbeTransport(
             _probes(splats, objects, flat, states[0]),
             _mirror_images(splats, scene, list(delta_mirrors.values()), states),
-            dr.opaque(mi.Float, splats.exposure),
+            dr.opaque(mi.Float, splats.lighting.radiance_scale),
             {k: mi.ShapePtr(shape) for k, shape in shapes.items()},
             {k: mi.EmitterPtr(node) for k, node in emitters.items() if node},
             {k: number for number, k in enumerate(delta_mirrors)},
             dr.opaque(mi.Float, num_paths),
-            unseen,
+            RayTransport.from_splats(splats) if splats.lighting.probe_fallback == "rays" else None,
         )
 
     @override
@@ -212,11 +210,12 @@ class ProbeTransport(SplatTransport):
         seen, is_asked, is_reversed = self._look(segment, active)
         is_known = is_asked & seen.is_known
         radiance, T = mi.Color3f(0), mi.Float(1)
-        if self.unseen is not None:
-            radiance, T = self.unseen.composite_segment(segment, sample, is_asked & ~seen.is_known)
+        if self.fallback is not None:
+            unknown = is_asked & ~seen.is_known
+            radiance, T = self.fallback.composite_segment(segment, sample, unknown)
         color = mi.Color3f(seen.color)
         color = dr.select(segment.is_open, _over_black(color, seen.coverage), color)
-        radiance = dr.select(is_known, self.exposure * color, radiance)
+        radiance = dr.select(is_known, self.radiance_scale * color, radiance)
         # An emitter's probe has transmittances of its light, but no view of splats from elsewhere.
         radiance = dr.select(is_reversed, 0, radiance)
         return radiance, dr.select(is_known, 1 - seen.coverage, T)
@@ -319,7 +318,7 @@ def _warn_of_close(
 
 def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int, FlatMirror]:
     """Return flat mirrors among the shapes, by the probe's number."""
-    from drgs.integrator.mirrors import FlatMirror
+    from drgs.integrator.light.mirrors import FlatMirror
 
     def recognise() -> dict[int, FlatMirror]:
         every = {k: FlatMirror.from_shape(shape) for k, shape in shapes.items()}
@@ -331,7 +330,7 @@ def _flat_mirrors(splats: SplatsState, shapes: dict[int, mi.Shape]) -> dict[int,
 def _mirror_images(
     splats: SplatsState, scene: mi.Scene, mirrors: list[FlatMirror], states: list[SensorState]
 ) -> Mirrors | None:
-    from drgs.integrator.mirrors import Mirrors
+    from drgs.integrator.light.mirrors import Mirrors
 
     gaussians, surfaces = dr.detach(splats.gaussians), splats.cache.surfaces
     if not mirrors or surfaces is None:
@@ -369,6 +368,20 @@ def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Emitter | mi.Shap
     check_ids("probes must be ids of the scene's shapes and emitters", names, nodes)
     known = {node.id(): node for node in nodes}
     return [known[name] for name in names]
+
+
+def check_ids(parameter: str, names: Sequence[str], nodes: Sequence[mi.Object]) -> None:
+    """Raise PluginError for names that are no node's id; parameter: the property, in words."""
+    known = [node.id() for node in nodes]
+    for name in names:
+        if name not in known:
+            message = f"splats: {parameter}, got {name!r}; there are {', '.join(known)}"
+            if any(isinstance(node, mi.Mesh) and not node.id() for node in nodes):
+                message += (
+                    "; Mitsuba merges meshes with equal BSDFs, which then have no id: load the "
+                    "scene with optimize=False"
+                )
+            raise PluginError(message)
 
 
 def _center(node: mi.Emitter | mi.Shape) -> list[float]:

@@ -18,7 +18,7 @@ from drgs.cameras.camera import Camera
 from drgs.core.types import Float
 from drgs.effects.occlusion import Surface
 from drgs.integrator.film import num_samples, pixel_corners
-from drgs.integrator.rays import MAX_INVISIBLE_OPACITY, StraightRays
+from drgs.integrator.light.rays import MAX_INVISIBLE_OPACITY, StraightRays
 
 EDGE_GRID = 4  # rays along each axis of a pixel in which a surface ends
 MAX_SURFACES = 4  # seen one through the other; the last one stands for all that follow

@@ -1,7 +1,7 @@
 """Meshes and other surfaces among splats; imported when a scene has surfaces.
 
-A nested integrator, such as Mitsuba's ``path``, renders them at
-the depths of the surfaces in each pixel, between the splats (``drgs.integrator.visible_surfaces``).
+A nested integrator, such as Mitsuba's ``path``, renders them at the depths of the surfaces in each
+pixel, between the splats (:mod:`drgs.integrator.light.visible_surfaces`).
 With p_k the part of the light that the k-th surface stops, T_k the transmittance of the splats in
 front of it, T that of all splats, L_k the surface's radiance, B the background, and C and A the
 sums of the colours and weights of the splats as far as surfaces let them through
@@ -10,8 +10,8 @@ sums of the colours and weights of the splats as far as surfaces let them throug
     A D(C / A) + sum_k T_k L_k + T (1 - sum_k p_k) B.
 
 With N_k the nested image from behind the first k surfaces, times their transmittance
-(``drgs.integrator.rays``), L_k = N_(k - 1) - N_k. Behind the last surface, N_k is (1 - sum_k p_k) B
-where the nested integrator shows the background, and else 0.
+(``drgs.integrator.light.rays``), L_k = N_(k - 1) - N_k. Behind the last surface, N_k is
+(1 - sum_k p_k) B where the nested integrator shows the background, and else 0.
 
 Not differentiated: the depth of a surface, the part of a pixel that it covers, its silhouette.
 """
@@ -30,9 +30,14 @@ import numpy as np
 from drgs.core.arrays import image_of, planes_of
 from drgs.core.errors import PluginError, UnsupportedError, format_names, one_line, root_cause
 from drgs.core.private import same_variables
-from drgs.integrator.derivatives import Parameter, attached_parameters, parameter_value, type_of
 from drgs.integrator.film import Channels, develop_pixels, film_map, num_colors, pixels_adjoint
-from drgs.integrator.rays import (
+from drgs.integrator.light.derivatives import (
+    Parameter,
+    attached_parameters,
+    parameter_value,
+    type_of,
+)
+from drgs.integrator.light.rays import (
     UNBOUNDED_DEPTH,
     RaysBehind,
     StraightRays,
@@ -40,8 +45,9 @@ from drgs.integrator.rays import (
     has_transparent_parts,
     sensor_behind,
 )
+from drgs.integrator.light.visible_surfaces import SurfaceLayers, transmittance_behind
 from drgs.integrator.sensors import sensors_of
-from drgs.integrator.visible_surfaces import SurfaceLayers, transmittance_behind
+from drgs.integrator.state import SplatsState, surfaces_in
 
 T = TypeVar("T")
 
@@ -65,7 +71,7 @@ class Surfaces:
     def find(scene: mi.Scene, last: Surfaces | None) -> Surfaces:
         """Find the surfaces of a scene, or return ``last`` if they are still the same."""
         objects, parameters = _surroundings(scene)
-        has_gaussians = any(shape.is_ellipsoids() for shape in scene.shapes())
+        has_gaussians = len(surfaces_in(scene)) < len(scene.shapes())
         if (
             last is not None
             and (last.apart is not None) == has_gaussians
@@ -113,8 +119,8 @@ def scene_of(objects: list[mi.Object]) -> mi.Scene:
 
 
 @dataclass(frozen=True)
-class Insertion:
-    """Insertion of nested images into the image of the splats; all are developed already.
+class SurfaceCompositor:
+    """Compositing of nested images with the image of the splats; all are developed already.
 
     The last channels of the splats' image are, for each surface, its share p_k T_k and coverage
     p_k, and where the nested image shows a background, (1 - sum p_k) B in linear RGB.
@@ -238,8 +244,8 @@ def _apply_map(matrix: np.ndarray, planes: list[mi.Float]) -> list[mi.Float]:
 
 
 @dataclass(frozen=True)
-class Hybrid:
-    """The surfaces in an image of splats and surfaces."""
+class NestedSurfaces:
+    """The surfaces in an image of splats and surfaces, and their nested integrator."""
 
     surfaces: Surfaces
     integrator: mi.SamplingIntegrator  # of the image
@@ -247,12 +253,50 @@ class Hybrid:
     sensor: mi.Sensor
     seed: int | mi.UInt32
     spp: int  # of the nested integrator; 0: as the sensor's sampler has it
-    insertion: Insertion
+    compositor: SurfaceCompositor
     rays: StraightRays  # through the scene that the nested integrator renders
 
-    def with_surfaces(self, count: int) -> Hybrid:
+    @staticmethod
+    def from_scene(
+        splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, seed: int | mi.UInt32, spp: int
+    ) -> NestedSurfaces:
+        """Choose the nested integrator; spp: 0 for that of the sensor's sampler."""
+        cache, hide_emitters = splats.cache, splats.hide_emitters
+        surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
+        count = splats.nested_spp or spp
+        nested: mi.SamplingIntegrator
+        adjoint: mi.SamplingIntegrator
+        if splats.lighting.light != "none":
+            from drgs.integrator.light.splat_transport import nested_with_transport
+
+            num_paths = count or sensor.sampler().sample_count()
+            nested = adjoint = nested_with_transport(splats, scene, num_paths, sensors_of(sensor))
+        else:
+            if splats.nested is not None:
+                nested = adjoint = splats.nested
+            else:
+                # The same paths as ``path``, with correct derivatives for more parameters, and
+                # lamps seen through transparent surfaces.
+                adjoint = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
+                nested = adjoint
+                if not surfaces.is_transparent:
+                    nested = mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
+            if isinstance(nested, TransportIntegrator):
+                nested.use_transport(None)  # another integrator may have given it one
+        compositor = SurfaceCompositor(
+            sensor.film(),
+            cache.film_maps,
+            splats.aov_names(),
+            shows_background=not hide_emitters and scene.environment() is not None,
+            display_space=not splats.srgb_primitives,
+        )
+        traced = surfaces.scene_to_trace(scene)
+        rays = StraightRays(traced, hide_emitters, hide_emitters or surfaces.is_transparent)
+        return NestedSurfaces(surfaces, nested, adjoint, sensor, seed, count, compositor, rays)
+
+    def with_surfaces(self, count: int) -> NestedSurfaces:
         """Return a copy for ``count`` surfaces that are seen one through the other."""
-        return replace(self, insertion=replace(self.insertion, num_surfaces=count))
+        return replace(self, compositor=replace(self.compositor, num_surfaces=count))
 
     def images(self) -> list[mi.TensorXf]:
         """Return N_0, N_1, ..., developed. Leaves the film with the last."""
@@ -266,7 +310,7 @@ class Hybrid:
     ) -> list[mi.Color3f]:
         """Return N_0, N_1, ... along single rays."""
         found = []
-        for count in range(self.insertion.num_surfaces):
+        for count in range(self.compositor.num_surfaces):
             behind, weight = mi.RayDifferential3f(ray), mi.Float(1)
             if self.surfaces.is_transparent:
                 behind, weight = RaysBehind(self.rays, count).advance(behind, active)
@@ -331,7 +375,7 @@ class Hybrid:
             with _keep_sample_count(self.sensor):
                 yield self.sensor
             return
-        for count in range(self.insertion.num_surfaces):
+        for count in range(self.compositor.num_surfaces):
             behind = RaysBehind(self.rays, count)
             sensor = sensor_behind(self.sensor, sensors_of(self.sensor), behind)
             with (

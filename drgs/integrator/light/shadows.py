@@ -23,11 +23,10 @@ import mitsuba as mi
 from drgs.core.constants import SH_C0
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.quaternions import quat_to_rotation
-from drgs.integrator.checks import check_ids
-from drgs.integrator.rays import StraightRays, has_transparent_parts
-from drgs.integrator.splat_transport import ray_splats_of
+from drgs.integrator.light.rays import StraightRays, has_transparent_parts
+from drgs.integrator.light.splat_transport import check_ids, ray_splats_of
+from drgs.integrator.light.surfaces import Surfaces, scene_of
 from drgs.integrator.state import SplatsState
-from drgs.integrator.surfaces import Surfaces, scene_of
 from drgs.light.walk import RaySplats, Segment
 from drgs.splatting.projection import load_rows
 
@@ -40,18 +39,19 @@ SHADOW_OFFSET_STDS = 3.0  # along the shortest axis: a splat's own alpha does no
 
 def shade(splats: SplatsState, scene: mi.Scene) -> None:
     """Shade the Gaussians by the objects that cast shadows; PluginError for unknown names."""
-    gaussians, cache = dr.detach(splats.unshaded_gaussians), splats.cache
+    gaussians, cache = dr.detach(splats.gaussians), splats.cache  # not shaded yet
     surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
 
     def estimate() -> Gaussians:
         shapes = [node for node in surfaces.objects if isinstance(node, mi.Shape)]
-        check_ids("shadows must be ids of the scene's shapes", splats.shadows, shapes)
+        check_ids("shadows must be ids of the scene's shapes", splats.lighting.shadows, shapes)
         rays = _rays_through(surfaces.objects)
-        without = _rays_through([o for o in surfaces.objects if o.id() not in splats.shadows])
+        without = _rays_through(
+            [o for o in surfaces.objects if o.id() not in splats.lighting.shadows]
+        )
         blocked_by = ray_splats_of(gaussians, splats.approximations, degree=0)
         return _darken(gaussians, _Estimate(rays, without, blocked_by).ratios(gaussians))
 
-    cache.shaded = None
     cache.shaded = cache.find("shaded", (surfaces,), gaussians, estimate).value
 
 

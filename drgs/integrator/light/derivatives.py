@@ -9,8 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.core.errors import UnsupportedError, format_names
-from drgs.integrator.checks import ellipsoids_in
-from drgs.integrator.rays import TransportIntegrator
+from drgs.integrator.light.rays import TransportIntegrator
 from drgs.integrator.state import SplatsState
 
 ATTACHED_INTEGRATORS = ("PathIntegrator", "DirectIntegrator")  # samples move with parameters
@@ -68,13 +67,14 @@ def check_derivatives(
     splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode
 ) -> None:
     """Raise UnsupportedError for a parameter whose derivative would be wrong."""
-    parts = splats.parts(ellipsoids_in(scene)) if splats.light != "none" or splats.shadows else []
+    light, shadows = splats.lighting.light, splats.lighting.shadows
+    is_lit = light != "none" or bool(shadows)
+    parts = splats.attached_parts(scene) if is_lit else []
     if any(dr.grad_enabled(value) for part in parts for value in part.values.values()):
         raise UnsupportedError(
-            f"splats: with light '{splats.light}' and shadows "
-            f"'{', '.join(splats.shadows)}', the Gaussians are not differentiated, as surfaces "
-            "show and shade them; detach their parameters, or set light to 'none' and leave out "
-            "shadows"
+            f"splats: with light '{light}' and shadows '{', '.join(shadows)}', the Gaussians are "
+            "not differentiated, as surfaces show and shade them; detach their parameters, or set "
+            "light to 'none' and leave out shadows"
         )
     for name, value in mi.traverse(sensor):
         if dr.grad_enabled(value):
@@ -138,7 +138,7 @@ def _refusal(parameter: Parameter, splats: SplatsState) -> str | None:
     nested, owner = splats.nested, parameter.owners[0]
     kind = SPLATPATH if nested is None else type_of(nested)
     is_of_emitter = any(isinstance(node, mi.Emitter) for node in parameter.owners)
-    if splats.shadows and (is_of_emitter or parameter.is_geometry):
+    if splats.lighting.shadows and (is_of_emitter or parameter.is_geometry):
         return "how surfaces shade splats, which changes with it, is not; leave out shadows"
     if parameter.bsdfs:
         return _bsdf_refusal(parameter, kind)
@@ -151,7 +151,7 @@ def _refusal(parameter: Parameter, splats: SplatsState) -> str | None:
     if isinstance(owner, mi.Emitter) and parameter.key in ("position", "to_world"):
         if kind in (ATTACHED_INTEGRATORS if owner.is_environment() else REPLAYED_INTEGRATORS):
             return f"{kind} does not follow a lamp that moves; {TO_SPLATPATH}"
-        if splats.light != "none" and not owner.is_environment():
+        if splats.lighting.light != "none" and not owner.is_environment():
             return "the shadows that splats throw move with it; set light to 'none'"
     return None
 

@@ -26,7 +26,7 @@ from drgs.cameras.lens import Lens, Pinhole
 from drgs.config.approximations import Approximations
 from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.rays import PathSegment, StraightRays, has_transparent_parts
+from drgs.integrator.light.rays import PathSegment, StraightRays, has_transparent_parts
 from drgs.integrator.sensors import SensorState, camera_from_sensor
 from drgs.light.probe import LOW_PASS, ProbeHit, bilinear_texels
 from drgs.splatting import rendering

@@ -1,0 +1,465 @@
+"""The cheapest approximations whose images stay within an error, found by measuring a few views.
+
+The error of an image is its root mean square difference from the most accurate image, over pixels
+and channels in display space: the best projection, an order per pixel, colours along each pixel's
+ray, and almost no cut-offs.
+
+Each approximation is measured alone, as the difference of two images that differ in nothing else.
+They are nearly independent, so that the squares of their errors add. What takes no order per pixel
+is measured on whole views; orders are, in a window of each (:meth:`Renderer.view`). There, the
+cheapest combination within the budget is also compared with the most accurate image, which corrects
+the sum.
+
+Costs are typical ones, not measured: the choice is the same in every run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, NamedTuple
+
+import drjit as dr
+import numpy as np
+from scipy.stats import t as student_t
+
+from drgs.cameras.camera import Camera, cameras_in_time
+from drgs.cameras.lens import Pinhole
+from drgs.cameras.motion import MotionBlur
+from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
+from drgs.core.arrays import types_of
+from drgs.core.constants import ALPHA_CUT, MAX_SHUTTER_SAMPLES, TRANSMITTANCE_STOP
+from drgs.core.types import Float
+
+MIN_VIEWS, MAX_VIEWS = 3, 6  # that are measured, if there are so many
+MAX_PIXELS = 4_000_000  # of them together, unless they are the fewest
+WINDOW_PX = 140  # side of a window, at most about
+AREA_SHARE = 0.2  # of the probability of a cell, by its area; the rest by its error
+CONFIDENCE = 0.95  # share of the views that shall be within the budget
+TYPICAL_SPREAD = 0.15  # of the logarithm of the errors of a file's views
+CLEARLY = 0.9  # of the error or the time of a choice, the next one's at most
+SPREAD_VIEWS = 6  # views that TYPICAL_SPREAD counts for
+
+SAMPLES = "shutter_samples"
+
+Changes = Mapping[str, Any]
+"""Values of approximations by name, and of :data:`SAMPLES`."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """Values of approximations that are chosen together, with their typical cost."""
+
+    changes: Changes
+    cost: float  # relative to the first levels of all others, ordered by the means' depths
+    cost_ordered: float = 0.0  # ordered at each pixel; 0: the same
+
+    def factor(self, is_ordered: bool) -> float:
+        """Return the factor of the time of an image."""
+        return self.cost_ordered if is_ordered and self.cost_ordered else self.cost
+
+
+def cut_offs(alpha_cut: float, transmittance_stop: float) -> Changes:
+    """Return the values of both cut-offs."""
+    return {"alpha_cut": alpha_cut, "transmittance_stop": transmittance_stop}
+
+
+CENTER = Level({"order": "center"}, 1)
+WINDOWED = tuple(
+    Level({"order": "pixel", "order_window": window}, cost)
+    for window, cost in ((1, 3.3), (4, 4.4), (8, 7), (16, 12), (32, 22))
+)
+"""Costs are those of ``docs/results/accuracy.md``, rounded, as are those of the others."""
+
+DIRECTIONS = (Level({"sh_direction": "mean"}, 1), Level({"sh_direction": "pixel"}, 3, 1.6))
+CUT_OFFS = (
+    Level(cut_offs(1 / 64, 1e-2), 0.87, 0.8),
+    Level(cut_offs(ALPHA_CUT, TRANSMITTANCE_STOP), 1),
+    Level(cut_offs(1 / 2048, 1e-6), 1.25, 1.45),
+)
+FINEST_CUT_OFFS = cut_offs(1e-5, 1e-7)
+
+
+def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:
+    """Return the projections that the cameras' lenses allow, the most accurate one last."""
+    ewa, unscented = Level({"projection": "ewa"}, 1), Level({"projection": "unscented"}, 1.03)
+    if all(isinstance(camera.lens, Pinhole) for camera in cameras):
+        return ewa, Level({"projection": "exact"}, 1.2, 1.05)
+    # DirectProjection along parallel rays, Gaussians are Gaussians.
+    return (ewa,) if all(camera.lens.parallel for camera in cameras) else (ewa, unscented)
+
+
+def own_samples(cameras: Sequence[Camera]) -> int:
+    """Return the largest number of times of an open shutter; 0: no camera has one."""
+    shutters = [one.shutter for one in cameras]
+    return max((one.samples for one in shutters if isinstance(one, MotionBlur)), default=0)
+
+
+def shutter_samples(cameras: Sequence[Camera]) -> tuple[Level, ...]:
+    """Return numbers of times of an open shutter, if a camera has one; costs relative to its own.
+
+    Twice the last one is taken for exact.
+    """
+    own = own_samples(cameras)
+    counts = sorted({max(1, own // 4), max(1, own // 2), own, 2 * own}) if own else []
+    return tuple(Level({SAMPLES: n}, n / own) for n in counts if n <= MAX_SHUTTER_SAMPLES)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Approximations, with their error and time."""
+
+    approximations: Approximations
+    changes: Changes  # those of an error budget among them
+    error: float  # that CONFIDENCE of the views do not exceed; 0..1
+    cost: float  # typical time relative to that of the default
+
+    @property
+    def shutter_samples(self) -> int | None:
+        """Times of an open shutter; None: no camera has one."""
+        return self.changes.get(SAMPLES)
+
+    @property
+    def words(self) -> str:
+        """The values that differ from the default, as they are set."""
+        default = Approximations()
+        others = {k: v for k, v in self.changes.items() if v != getattr(default, k, None)}
+        if others.get("order") == "pixel":
+            others["order_window"] = self.changes["order_window"]
+        words = [f"{k}={v if isinstance(v, str) else f'{v:.2g}'}" for k, v in others.items()]
+        return " ".join(words) or "the default"
+
+
+@dataclass(frozen=True)
+class BudgetReport:
+    """The choice for an error budget, with its neighbours."""
+
+    budget: float
+    chosen: Choice  # its error was measured against the most accurate image
+    errors: tuple[float, ...]  # of the measured views
+    better: Choice | None  # next choice with a clearly smaller error; None: there is none
+    faster: Choice | None  # next choice that is clearly faster
+
+    def line(self) -> str:
+        """Return one line for the user."""
+        low, high = min(self.errors), max(self.errors)
+        line = (
+            f"error at most {self.budget:.2g}: {self.chosen.words}: {low:.2g} to {high:.2g} at "
+            f"{len(self.errors)} views, about {self.chosen.cost:.2g} times the time of the default"
+        )
+        for other in (self.faster, self.better):
+            if other is not None:
+                line += f"; {other.cost:.2g} times for {other.error:.2g} ({other.words})"
+        return line
+
+    def record(self) -> dict[str, Any]:
+        """Return the numbers to be recorded beside images, for JSON."""
+
+        def numbers(choice: Choice | None) -> dict[str, Any] | None:
+            if choice is None:
+                return None
+            return {**choice.changes, "error": choice.error, "cost": choice.cost / self.chosen.cost}
+
+        return {
+            "budget": self.budget,
+            "chosen": numbers(self.chosen),
+            "measured_errors": list(self.errors),
+            "time_relative_to_default": self.chosen.cost,
+            "next_better": numbers(self.better),
+            "next_faster": numbers(self.faster),
+        }
+
+
+@dataclass(frozen=True)
+class MeasuredView:
+    """A view that is measured, and the window in which orders are."""
+
+    camera: Camera
+    rows: slice  # of the window
+    columns: slice
+    window: Camera
+    share: float  # probability with which the window was drawn
+
+    def mean_square(self, one: np.ndarray, other: np.ndarray) -> float:
+        """Return the mean square difference of the view from images (H, W, 3) of its window."""
+        total = float(np.square(one - other, dtype=np.float64).sum())
+        return total / self.share / (3 * self.camera.width * self.camera.height)
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """Renders Gaussians with approximations that differ from given ones."""
+
+    planes: Callable[[Camera, Approximations], list[Float]]  # transmittance, red, green, blue
+    given: Approximations  # their filters and falloff are kept
+    background: tuple[float, float, float]  # display space
+
+    def image(self, camera: Camera, *changes: Changes) -> np.ndarray:
+        """Return (H, W, 3) float32, display space, not clamped."""
+        values = {k: v for change in changes for k, v in change.items()}
+        samples, images = values.pop(SAMPLES, 1), []
+        background = np.array(self.background, np.float32)
+        for one in cameras_in_time(camera, samples):
+            transmittance, *color = self.planes(one, replace(self.given, **values))
+            image = np.stack([np.array(plane) for plane in color], axis=-1)
+            images.append(image + np.array(transmittance)[:, None] * background)
+        return np.mean(images, axis=0).reshape(camera.height, camera.width, 3)
+
+    def view(self, camera: Camera, place: float) -> MeasuredView:
+        """Return a view with a window; place: 0..1, of the window among the cells of the film.
+
+        Cells are drawn in proportion to the error of an order by one splat, and to a part to their
+        area: the mean over places of the errors of cells, divided by their shares, is the error of
+        the image.
+        """
+        one, other = (
+            self.image(camera, CUT_OFFS[1].changes, order.changes)
+            for order in (CENTER, WINDOWED[0])
+        )
+        error = np.square(one - other, dtype=np.float64).sum(axis=-1)
+        rows, columns = (np.arange(0, size, _cell_size(size)) for size in error.shape)
+        shares = AREA_SHARE * _sums(np.ones_like(error), rows, columns)
+        shares = (shares + (1 - AREA_SHARE) * _sums(error, rows, columns)).ravel()
+        shares /= shares.sum()
+        order = np.argsort(-shares, kind="stable")
+        cell = order[min(np.searchsorted(np.cumsum(shares[order]), place), shares.size - 1)]
+        (y, x), (height, width) = divmod(int(cell), len(columns)), error.shape
+        y, x = int(rows[y]), int(columns[x])
+        end_y, end_x = min(y + _cell_size(height), height), min(x + _cell_size(width), width)
+        window = crop(camera, x, y, end_x - x, end_y - y)
+        return MeasuredView(camera, slice(y, end_y), slice(x, end_x), window, float(shares[cell]))
+
+
+def _sums(values: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the sums of cells, relative to that of all; rows, columns: where cells begin."""
+    sums = np.add.reduceat(np.add.reduceat(values, rows), columns, axis=1)
+    return sums / max(sums.sum(), 1e-30)
+
+
+def _cell_size(size: int) -> int:
+    """Return the side of cells along a side of the film, px."""
+    return 4 * math.ceil(size / math.ceil(size / WINDOW_PX) / 4)
+
+
+def crop(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
+    """Return the camera of a window of the film."""
+    t = types_of(type(camera.near))
+    offset = t.Array2f(dr.opaque(t.Float, x), dr.opaque(t.Float, y))
+    return replace(
+        camera,
+        principal=camera.principal - offset,
+        film_start=camera.film_start - offset,
+        film_end=camera.film_end - offset,
+        width=width,
+        height=height,
+    )
+
+
+def bound(errors: Sequence[float] | np.ndarray) -> float:
+    """Return the error that :data:`CONFIDENCE` of all views do not exceed, from those of some.
+
+    Above their root mean square, errors are log-normal. Their spread is that of the views above it,
+    and a typical one's: views that are nearly exact say nothing of the others.
+    """
+    center = max(math.sqrt(np.mean(np.square(errors))), 1e-9)
+    above = np.log(np.maximum(errors, center) / center)
+    freedom, count = len(errors) - 1 + SPREAD_VIEWS, len(errors)
+    variance = (2 * np.square(above).sum() + SPREAD_VIEWS * TYPICAL_SPREAD**2) / freedom
+    width = student_t.ppf(CONFIDENCE, freedom) * math.sqrt(variance * (1 + 1 / count))
+    return center * math.exp(width)
+
+
+def measured_places(num_views: int, pixels: int) -> list[int]:
+    """Return the places of the views that are measured, evenly among all; pixels: of a view."""
+    count = min(num_views, max(MIN_VIEWS, min(MAX_VIEWS, MAX_PIXELS // pixels)))
+    return [int((k + 0.5) * num_views / count) for k in range(count)]
+
+
+class LevelSquares(NamedTuple):
+    """The mean square errors of a level alone."""
+
+    level: Level
+    of_views: np.ndarray  # (V,)
+    in_windows: np.ndarray  # (V,): those of the views, as their windows tell
+
+
+class Combination(NamedTuple):
+    """A combination of levels; its squares are the sums of those of the levels."""
+
+    choice: Choice  # with a predicted error
+    of_views: np.ndarray
+    in_windows: np.ndarray
+
+
+class Search:
+    """Combinations of levels for some cameras, their predicted errors, and those measured."""
+
+    def __init__(self, renderer: Renderer, cameras: Sequence[Camera]) -> None:
+        """Measure each level alone on some views, and predict the errors of all combinations."""
+        check_no_extensions(renderer.given)
+        pixels = max(camera.width * camera.height for camera in cameras)
+        cameras = [cameras[k] for k in measured_places(len(cameras), pixels)]
+        views = [renderer.view(one, (k + 0.5) / len(cameras)) for k, one in enumerate(cameras)]
+        self._renderer, self._views = renderer, views
+        self._whole: dict[frozenset, list[np.ndarray]] = {}
+        self._windows: dict[frozenset, list[np.ndarray]] = {}
+        projected = projections(cameras)
+        first = projected[0], CENTER, DIRECTIONS[0], CUT_OFFS[1]
+        self._start = {k: v for level in first for k, v in level.changes.items()}
+        orders = self._squares_of_orders()
+        squares = [
+            orders,
+            self._squares(projected, projected[-1].changes),
+            self._squares(DIRECTIONS, DIRECTIONS[-1].changes),
+            self._squares(CUT_OFFS, FINEST_CUT_OFFS),
+        ]
+        samples = shutter_samples(cameras)
+        self._most_samples = {SAMPLES: 2 * samples[-1].changes[SAMPLES]} if samples else {}
+        if samples:
+            squares.append(self._squares(samples, self._most_samples))
+        self.front = _front(renderer.given, squares)
+        """Combinations that no other one beats in cost and predicted error, by cost."""
+        finest = orders[-1]
+        self._unordered = finest.of_views
+        last = projected[-1], finest.level, DIRECTIONS[-1]
+        best = {k: v for level in last for k, v in level.changes.items()}
+        self._references = self._in_windows({**best, **FINEST_CUT_OFFS})
+
+    def _of_views(self, changes: Changes) -> list[np.ndarray]:
+        """Return the images of the views, with the cheapest approximations but for ``changes``."""
+        values = {**self._start, **changes}
+        key = frozenset(values.items())
+        if key not in self._whole:
+            found = [self._renderer.image(view.camera, values) for view in self._views]
+            self._whole[key] = found
+        return self._whole[key]
+
+    def _in_windows(self, changes: Changes) -> list[np.ndarray]:
+        """Return the images of the windows, likewise."""
+        values = {**self._start, **changes}
+        if values["order"] == CENTER.changes["order"]:
+            pairs = zip(self._of_views(changes), self._views, strict=True)
+            return [image[view.rows, view.columns] for image, view in pairs]
+        key = frozenset(values.items())
+        if key not in self._windows:
+            found = [self._renderer.image(view.window, values) for view in self._views]
+            self._windows[key] = found
+        return self._windows[key]
+
+    def _differences(self, changes: Changes, target: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the mean square differences (V,) of the views, from those of the windows."""
+        triples = zip(self._views, self._in_windows(changes), target, strict=True)
+        return np.array([view.mean_square(one, other) for view, one, other in triples])
+
+    def _squares(self, levels: Sequence[Level], finest: Changes) -> list[LevelSquares]:
+        exact, found = self._of_views(finest), []
+        for level in levels:
+            pairs = zip(self._of_views(level.changes), exact, strict=True)
+            squares = [np.square(one - other, dtype=np.float64).mean() for one, other in pairs]
+            in_windows = self._differences(level.changes, self._in_windows(finest))
+            found.append(LevelSquares(level, np.array(squares), in_windows))
+        return found
+
+    def _squares_of_orders(self) -> list[LevelSquares]:
+        """Return those of orders; the last one's is extrapolated from the two windows before it."""
+        levels, target = (CENTER, *WINDOWED[:-1]), self._in_windows(WINDOWED[-1].changes)
+        squares = [self._differences(level.changes, target) for level in levels]
+        before, last = squares[-2:]
+        squares.append(last * np.minimum(last / np.maximum(before, 1e-20), 0.5))
+        return [
+            LevelSquares(level, found, found)
+            for level, found in zip((CENTER, *WINDOWED), squares, strict=True)
+        ]
+
+    def choose(self, budget: float) -> BudgetReport:
+        """Return the cheapest approximations whose error is within ``budget``.
+
+        Raises ValueError if no combination is.
+        """
+        place, of_views, errors = self.cheapest(budget)
+        pairs = zip(self.front, errors, strict=True)
+        front = [replace(one.choice, error=error) for one, error in pairs]
+        chosen = front[place]
+        return BudgetReport(
+            budget,
+            chosen,
+            tuple(of_views),
+            next((one for one in front[place:] if one.error < CLEARLY * chosen.error), None),
+            next((one for one in front[place::-1] if one.cost < CLEARLY * chosen.cost), None),
+        )
+
+    def correction(self, place: int) -> float:
+        """Return the measured square error in the windows, relative to the sum of the levels'.
+
+        place: in ``front``. The errors of the most accurate image, and of the times of a shutter,
+        are added.
+        """
+        candidate = self.front[place]
+        changes = {k: v for k, v in candidate.choice.changes.items() if k != SAMPLES}
+        measured = self._differences(changes, self._references) + self._unordered
+        if self._most_samples:
+            samples = {SAMPLES: candidate.choice.changes[SAMPLES]}
+            measured += self._differences(samples, self._in_windows(self._most_samples))
+        return float(measured.sum() / max(candidate.in_windows.sum(), 1e-30))
+
+    def cheapest(self, budget: float) -> tuple[int, list[float], list[float]]:
+        """Return the place in ``front`` of the cheapest choice within a budget.
+
+        Also the errors of its views, and those of all of ``front``. Sums are corrected by what was
+        measured, of other choices by what was measured last. Raises ValueError if no choice is
+        within the budget.
+        """
+        corrections: dict[int, float] = {}  # of this budget: the choice depends on no other one
+        correction, last = 1.0, len(self.front) - 1
+        while True:
+            errors = [
+                bound(np.sqrt(corrections.get(k, correction) * candidate.of_views))
+                for k, candidate in enumerate(self.front)
+            ]
+            place = next((k for k, error in enumerate(errors) if error <= budget), last)
+            if place not in corrections:
+                correction = corrections[place] = self.correction(place)
+            elif errors[place] <= budget:
+                of_views = np.sqrt(corrections[place] * self.front[place].of_views)
+                return place, of_views.tolist(), errors
+            else:
+                raise ValueError(
+                    f"{budget:.2g} cannot be met here: the most accurate choice is within "
+                    f"{_rounded_up(errors[place])}"
+                )
+
+
+def _rounded_up(error: float) -> str:
+    digits = 1 - math.floor(math.log10(error))
+    return f"{math.ceil(error * 10**digits) / 10**digits:g}"
+
+
+def _front(given: Approximations, squares: Sequence[Sequence[LevelSquares]]) -> list[Combination]:
+    """Return the combinations that no other one beats in cost and error, by cost."""
+    found = []
+    for levels in product(*squares):
+        changes = {k: v for each in levels for k, v in each.level.changes.items()}
+        is_ordered = changes["order"] != "center"
+        cost = math.prod(each.level.factor(is_ordered) for each in levels)
+        of_views = np.sum([each.of_views for each in levels], axis=0)
+        in_windows = np.sum([each.in_windows for each in levels], axis=0)
+        approximations = replace(given, **{k: v for k, v in changes.items() if k != SAMPLES})
+        choice = Choice(approximations, changes, bound(np.sqrt(of_views)), cost)
+        found.append(Combination(choice, of_views, in_windows))
+    front: list[Combination] = []
+    for one in sorted(found, key=lambda one: (one.choice.cost, one.choice.error)):
+        if not front or one.choice.error < front[-1].choice.error:
+            front.append(one)
+    return front
+
+
+def check_no_extensions(given: Approximations) -> None:
+    """Raise ValueError for a projection, falloff or order of another package."""
+    for registry in (PROJECTIONS, FALLOFFS, ORDERS):
+        if (value := getattr(given, registry.kind)) not in registry.shipped_names:
+            raise ValueError(
+                f"cannot be met with the {registry.kind} '{value}', which is not drgs's own: what "
+                "is accurate, is not known; leave one of them out"
+            )
