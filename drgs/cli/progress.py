@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from typing import TextIO
 
 from rich.console import Console
@@ -104,10 +103,3 @@ class StepProgress:
         if done > self._most:
             self._most = done
             self._shown.update(done, total)
-
-
-@contextmanager
-def show_examination() -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of an examination on the terminal, within the block."""
-    with StepProgress("examining: ") as steps:
-        yield steps.update

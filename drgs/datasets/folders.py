@@ -59,7 +59,7 @@ def find_reader(
         ) from None
     is_auto = config.type == "auto"
     if is_auto:
-        candidates = [*map(READERS.get, READERS.shipped_names), *READERS.installed_extensions()]
+        candidates = sorted(READERS.all(), key=lambda reader: reader.value.order)
     else:
         candidates = [READERS.get(config.type, "data.type")]
     for extension in candidates:

@@ -258,6 +258,11 @@ def integrator_settings(effects: Sequence[TrainingEffect]) -> dict[str, str]:
     return {"aovs": aovs} if aovs else {}
 
 
+def entries(values: Float) -> list[mi.Float]:
+    """Return the entries as arrays of one, that are not compiled into the kernel."""
+    return [dr.gather(mi.Float, values, mi.UInt32(k)) for k in range(dr.width(values))]
+
+
 def as_numbers(values: np.ndarray) -> Float:
     """Upload an array as a flat one."""
     return cast(Float, from_host(mi.Float, values))

@@ -26,7 +26,7 @@ from drgs.core.errors import UserError
 from drgs.core.files import write_json
 from drgs.core.types import Array3f, Float
 from drgs.datasets.camera_file import cameras_json
-from drgs.effects.base import Finding, ShortFit, SimulatedEffect, join_parts
+from drgs.effects.base import Finding, ShortFit, SimulatedEffect, entries, join_parts
 from drgs.effects.optimised import OptimisedEffect
 
 if TYPE_CHECKING:
@@ -226,16 +226,16 @@ class CameraRefinement(OptimisedEffect):
     @staticmethod
     def _camera(start: _Start, leaves: Mapping[str, Float]) -> dict[str, dr.ArrayBase]:
         """Return the sensor's parameters, from the numbers that are optimised."""
-        turn, move = (mi.Vector3f(*_entries(leaves[name])) for name in ("turns", "moves"))
+        turn, move = (mi.Vector3f(*entries(leaves[name])) for name in ("turns", "moves"))
         rotation = rotation_matrix(cast(Array3f, turn))
         rows = [[rotation[i, j] for j in range(3)] + [move[i]] for i in range(3)]
         moved = start.to_world @ mi.Matrix4f([*rows, [0, 0, 0, 1]])
         fx, fy, cx, cy = start.intrinsics
         if "log_focals" in leaves:
-            wide, tall = map(dr.exp, _entries(leaves["log_focals"]))
+            wide, tall = map(dr.exp, entries(leaves["log_focals"]))
             fx, fy = fx * wide, fy * tall
         if "shifts" in leaves:
-            right, down = _entries(leaves["shifts"])
+            right, down = entries(leaves["shifts"])
             cx, cy = cx + right * start.size.x, cy + down * start.size.y
         signs = mi.Matrix4f(OPENCV_TO_MITSUBA.astype(np.float32))
         poses = {"to_world": moved @ signs}
@@ -311,8 +311,3 @@ def _transform(to_world: dr.ArrayBase) -> mi.AffineTransform4f:
 def _pose(to_world: dr.ArrayBase) -> np.ndarray:
     """Return a pose (4, 4) float64, OpenCV axes."""
     return np.array(to_world)[..., 0].astype(np.float64) @ OPENCV_TO_MITSUBA
-
-
-def _entries(values: Float) -> list[mi.Float]:
-    """Return each number as an array of one."""
-    return [dr.gather(mi.Float, values, mi.UInt32(k)) for k in range(dr.width(values))]

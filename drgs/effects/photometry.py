@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 from typing_extensions import override
@@ -27,7 +26,7 @@ from drgs.config.extensions import EFFECTS
 from drgs.core.errors import UserError
 from drgs.core.files import write_json
 from drgs.core.types import Float, TensorXf
-from drgs.effects.base import SimulatedEffect, as_tensor, opacity_of
+from drgs.effects.base import SimulatedEffect, as_tensor, entries, opacity_of
 from drgs.effects.colors import ColorConfig
 from drgs.effects.optimised import CenteredEffect
 
@@ -99,11 +98,11 @@ class Photometry(CenteredEffect):
         numbers, (r2, opaque) = self.attached[view.index], view.uploads[self.name]
         values = image.array
         if "vignetting" in numbers:
-            a, b, c = _entries(numbers["vignetting"])
+            a, b, c = entries(numbers["vignetting"])
             s = r2.array
             values = values * (1 + s * (a + b * (2 * s - 1) + c * (6 * s * (s - 1) + 1)))
         if "response" in numbers:
-            p, q = _entries(numbers["response"] - self.common)
+            p, q = entries(numbers["response"] - self.common)
             base = dr.clip(values, DARKEST, 1)
             values = values * dr.exp(dr.log(base) * (dr.exp(p + q * base) - 1))
         seen = type(image)(values, image.shape)
@@ -150,8 +149,3 @@ def _camera_key(view: View) -> tuple[object, ...]:
     """Return a key that is the same for photographs by the same camera."""
     size = view.width, view.height
     return *size, view.fx, view.fy, view.cx, view.cy, repr(view.lens)
-
-
-def _entries(values: Float) -> list[Float]:
-    """Return the entries as arrays of one, that are not compiled into the kernel."""
-    return [dr.gather(mi.Float, values, mi.UInt32(k)) for k in range(len(values))]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from drgs.cli.commands import CommandParser, file_or_folder, run_command
 from drgs.cli.execution import add_execution_arguments, execution_settings, select_variant
-from drgs.cli.progress import show_examination
+from drgs.cli.progress import StepProgress
 from drgs.config.load import load_config
 from drgs.config.section import format_value
 from drgs.core.environment import VARIANTS
@@ -53,8 +53,8 @@ def run(args: argparse.Namespace) -> None:
         dataset = load_dataset(config.data_for_training, sections=config.sections)
         print(dataset.description)
         select_variant(args.variant or VARIANTS[0])
-        with show_examination() as progress:
-            examination = examine(dataset, config, progress)
+        with StepProgress("examining: ") as steps:
+            examination = examine(dataset, config, steps.update)
     print(examination)
     if changes := examination.changes:
         words = ["drgs", "fit", str(args.config)]

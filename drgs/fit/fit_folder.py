@@ -19,7 +19,7 @@ from drgs.config.changes import given_keys, with_changes
 from drgs.config.schema import FitConfig
 from drgs.core.environment import processor
 from drgs.core.errors import UserError
-from drgs.core.files import atomic_path
+from drgs.core.files import atomic_path, write_json
 from drgs.core.folders import sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
 from drgs.effects.base import ChosenEffects
@@ -210,8 +210,7 @@ class FitFolder:
     def finish(self, metrics: FitMetrics | None = None) -> None:
         """Write ``metrics.json`` (None: it exists), and end the run by removing the checkpoint."""
         if metrics is not None:
-            with atomic_path(self.path / files.METRICS) as temporary:
-                temporary.write_text(json.dumps(metrics, indent=2) + "\n")
+            write_json(self.path / files.METRICS, metrics, indent=2)
         remove_checkpoint(self.path)
         folder.seal_run(self.path)
 

@@ -19,7 +19,7 @@ from typing_extensions import override
 
 from drgs.cli.ending import StopRequest
 from drgs.cli.execution import select_variant
-from drgs.cli.progress import RunProgress, show_examination
+from drgs.cli.progress import RunProgress, StepProgress
 from drgs.config.changes import with_changes
 from drgs.config.extensions import EXAMINERS
 from drgs.config.load import config_from, load_config
@@ -210,8 +210,8 @@ class FitSession:
             self._print("not examined: no examiner is installed")
             return
         examine: Examiner = EXAMINERS.get(names[0]).value
-        with show_examination() if self.uses_terminal else nullcontext() as progress:
-            self.examination = examine(dataset, given, progress)
+        with StepProgress("examining: ") if self.uses_terminal else nullcontext() as steps:
+            self.examination = examine(dataset, given, None if steps is None else steps.update)
         self._print(str(self.examination))
         changes = self.examination.changes
         if changes:

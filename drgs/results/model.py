@@ -20,7 +20,7 @@ from drgs.config.changes import is_open
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
 from drgs.core.errors import PluginError, UserError, format_names
-from drgs.core.files import atomic_path
+from drgs.core.files import write_json
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets import Dataset, load_dataset
 from drgs.effects.cameras import CAMERAS, CamerasConfig
@@ -72,8 +72,7 @@ class ImageFolder:
     def write_budget(self) -> None:
         """Write what an error budget has chosen, if there is one."""
         if self.budget is not None:
-            with atomic_path(self.path / ERROR_BUDGET) as temporary:
-                temporary.write_text(json.dumps(self.budget.record(), indent=2) + "\n")
+            write_json(self.path / ERROR_BUDGET, self.budget.record(), indent=2)
 
     def claim(self, names: Iterable[str], images: Iterable[Image]) -> Iterator[Image]:
         """Yield the images after claiming the files ``names``.

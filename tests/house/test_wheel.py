@@ -70,12 +70,12 @@ def wheel(tmp_path_factory):
     return build_wheel(copy_checkout(folder / "source"), folder)
 
 
-def install(wheel, folder):
+def make_environment(wheel, folder):
     """Return the folders of scripts and packages of a new virtual environment with the wheel."""
     run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder)
     scripts = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
     python = scripts / f"python{sysconfig.get_config_var('EXE') or ''}"
-    install_for(wheel, python)
+    install(wheel, python)
     # The dependencies are this environment's, and come last. Its own .pth files, such as that of
     # an editable drgs, are not read there.
     where = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder)
@@ -87,7 +87,7 @@ def install(wheel, folder):
 @pytest.fixture(scope="module")
 def scripts(wheel, tmp_path_factory):
     """Folder of the scripts of a new virtual environment with the wheel in it."""
-    return install(wheel, tmp_path_factory.mktemp("environment"))[0]
+    return make_environment(wheel, tmp_path_factory.mktemp("environment"))[0]
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ def test_the_console_script_and_the_module_are_the_same_program(scripts, tmp_pat
 
 def test_a_wheel_without_some_commands_has_the_others(wheel, tmp_path):
     """Entry points of missing packages are left out."""
-    scripts, packages = install(wheel, tmp_path)
+    scripts, packages = make_environment(wheel, tmp_path)
     for command in ("export", "poses", "capture", "bench", "examine"):
         shutil.rmtree(packages / "drgs" / command)
     commands = run(scripts / "drgs", "--help", cwd=tmp_path).partition("commands:")[2]
@@ -221,7 +221,7 @@ def test_external_package_can_use_every_extension_point(scripts, photographs):
     """A strategy, effect, loss, term, lens, falloff, file format and reader; no file of drgs."""
     folder = photographs
     source = shutil.copytree(REPOSITORY / "examples", folder / "source")
-    install_for(build_wheel(source, folder), scripts / "python")
+    install(build_wheel(source, folder), scripts / "python")
     shutil.rmtree(source)
     (folder / "fit.yml").write_text(CONFIGURATION)
     shown = run(scripts / "drgs", "fit", "fit.yml", "--out", "out", cwd=folder)

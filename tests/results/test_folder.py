@@ -8,6 +8,7 @@ from conftest import REPOSITORY
 from support.folders import contents
 
 from drgs.config.changes import is_open, with_changes
+from drgs.config.extensions import EFFECTS
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
@@ -154,9 +155,11 @@ def test_folder_in_place_of_a_result_is_not_removed(finished, is_recorded):
     assert (finished / "curves.png").is_dir()
 
 
-ALLOWED_NAMES = {"fit.py": {files.TENSORBOARD}, "results/files.py": {files.CONFIG, *result_names()}}
-"""Modules below ``results`` recognise a fit's folder by names that they write out themselves; the
-extra that a command asks for has the name of a folder."""
+EFFECT_NAMES = {f"effects/{e.name}.py": set(e.value.files) for e in EFFECTS.all()}
+
+OTHER_NAMES = {files.CONFIG, *result_names()} - set().union(*EFFECT_NAMES.values())
+
+ALLOWED_NAMES = {"results/files.py": OTHER_NAMES, **EFFECT_NAMES}
 
 
 @pytest.mark.slow
