@@ -58,21 +58,17 @@ BORDER_PX, BORDER_TOLERANCE, MIN_BORDER_SHARE = 2, 0.04, 0.6
 """A background of one colour: of each photograph's border, this share has it, but for this."""
 
 
-def _show_nothing(what: str, done: int, total: int) -> None:
-    del what, done, total
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Decision:
     """A row of the table: an effect, the evidence, and what a short fit has gained with it."""
 
     effect: str
     evidence: str
-    gain: float | None  # dB, mean over the held-out photographs; None: it was not tried
-    spread: float | None  # dB: standard error of this mean
-    cost: float | None  # time of iterations, relative to those without the effect
+    gain: float | None = None  # dB, mean over the held-out photographs; None: it was not tried
+    spread: float | None = None  # dB: standard error of this mean
+    cost: float | None = None  # time of iterations, relative to those without the effect
     changes: Mapping[str, object]  # values of the configuration that simulate it, by key
-    chosen: bool
+    chosen: bool = False
 
 
 @dataclass(frozen=True)
@@ -179,19 +175,19 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
     gains = fitted.psnr - without.psnr
     gain, spread = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains)))
     return Decision(
-        finding.effect,
-        finding.evidence,
-        gain,
-        spread,
-        fitted.wall_s / without.wall_s,
-        finding.changes,
+        effect=finding.effect,
+        evidence=finding.evidence,
+        gain=gain,
+        spread=spread,
+        cost=fitted.wall_s / without.wall_s,
+        changes=finding.changes,
         chosen=gain > max(MIN_GAIN_DB, spread * float(stdtrit(len(gains) - 1, CONFIDENCE))),
     )
 
 
 def _reject(finding: Finding, reason: str = "") -> Decision:
     evidence = finding.evidence + reason
-    return Decision(finding.effect, evidence, None, None, None, finding.changes, chosen=False)
+    return Decision(effect=finding.effect, evidence=evidence, changes=finding.changes)
 
 
 def _reason_not_examined(config: FitConfig, dataset: Dataset) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Iterator, Sequence
 
@@ -20,7 +19,7 @@ from drgs.cameras.viewpoints import (
 )
 from drgs.config.schema import FitConfig
 from drgs.core.constants import SHUTTER_SAMPLES
-from drgs.core.files import atomic_path
+from drgs.core.files import write_json
 from drgs.datasets.camera_file import read_viewpoints
 from drgs.effects.cameras import CAMERAS, CamerasConfig
 from drgs.io.images import check_animation, write_animation
@@ -72,8 +71,7 @@ def render_split(model: Model, split: str, folder: ImageFolder) -> Quality:
         "mean": mean,
         "views": {view.name: score for view, score in zip(views, scores, strict=True)},
     }
-    with atomic_path(folder.path / METRICS) as temporary:
-        temporary.write_text(json.dumps(_replace_infinities(report), indent=2) + "\n")
+    write_json(folder.path / METRICS, _replace_infinities(report), indent=2)
     return quality
 
 
