@@ -418,8 +418,7 @@ def _inverses(matrices: np.ndarray, dets: np.ndarray) -> np.ndarray:
 class _Footprint:
     """A splat on the pixels of its bounding box of h x w pixels."""
 
-    dx: np.ndarray  # (1, w) px, from the splat's mean to the pixel centres
-    dy: np.ndarray  # (h, 1) px
+    offsets: np.ndarray  # (h, w, 2) d, px, from the splat's mean to the pixel centres
     falloff: np.ndarray  # (h, w) exp(-d^T A d / 2)
     raw_alpha: np.ndarray  # (h, w) opacity * falloff, before the clamp
 
@@ -428,14 +427,12 @@ def _footprint(
     splats: Projection, i: int, box: tuple[slice, slice], period: float | None = None
 ) -> _Footprint:
     """Evaluate G(d) = exp(-d^T A d / 2) (3DGS, equation 4, on the film) in a box of pixels."""
-    (rows, columns), (x, y), conic = box, splats.means2d[i], splats.conics[i]
-    dx = (np.arange(columns.start, columns.stop) + 0.5 - x)[None, :]
+    y, x = np.mgrid[box] + 0.5
+    offsets = np.stack([x, y], axis=-1) - splats.means2d[i]
     if period is not None:
-        dx = dx - period * np.round(dx / period)
-    dy = (np.arange(rows.start, rows.stop) + 0.5 - y)[:, None]
-    a, b, c = conic[0, 0], conic[0, 1], conic[1, 1]
-    falloff = np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
-    return _Footprint(dx, dy, falloff, splats.opacities[i] * falloff)
+        offsets[..., 0] -= period * np.round(offsets[..., 0] / period)
+    falloff = np.exp(-0.5 * np.sum(offsets @ splats.conics[i] * offsets, axis=-1))
+    return _Footprint(offsets, falloff, splats.opacities[i] * falloff)
 
 
 def _pixel_boxes(
@@ -631,12 +628,9 @@ def composite_gradients(
         d_power = d_splat_alpha * alpha
 
         # dp/dA = -d d^T / 2 and, since d = pixel - mean2d, dp/dmean2d = A d.
-        sum_dx, sum_dy = np.sum(d_power * splat.dx), np.sum(d_power * splat.dy)
-        sum_dxdx = np.sum(d_power * splat.dx * splat.dx)
-        sum_dxdy = np.sum(d_power * splat.dx * splat.dy)
-        sum_dydy = np.sum(d_power * splat.dy * splat.dy)
-        d_means2d[i] = splats.conics[i] @ [sum_dx, sum_dy]
-        d_conics[i] = -0.5 * np.array([[sum_dxdx, sum_dxdy], [sum_dxdy, sum_dydy]])
+        weighted = d_power[..., None] * splat.offsets
+        d_means2d[i] = splats.conics[i] @ np.sum(weighted, axis=(0, 1))
+        d_conics[i] = -0.5 * np.einsum("hwi,hwj->ij", weighted, splat.offsets)
     return {
         "means2d": d_means2d,
         "conics": d_conics,
