@@ -30,7 +30,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError, one_line
 from drgs.datasets.images import smaller_view, with_arrays
-from drgs.datasets.types import Dataset, View, evenly_spaced
+from drgs.datasets.types import Dataset, evenly_spaced
 from drgs.effects.base import Finding, Progress, ShortFit
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import Start, gaussians_at, start_of
@@ -215,12 +215,9 @@ def split_views(dataset: Dataset) -> tuple[Dataset, int]:
     small = [with_arrays(smaller_view(view, factor)) for view in views]
     held_out = range(stride // 2, len(small), stride)
     train = tuple(view for index, view in enumerate(small) if index not in held_out)
-    test = tuple(view for view in (small[i] for i in held_out) if _has_pixels(view))
+    test = [small[index] for index in held_out]
+    test = tuple(view for view in test if view.mask is None or np.any(view.mask))
     return replace(dataset, train=train, test=test), factor
-
-
-def _has_pixels(view: View) -> bool:
-    return view.mask is None or bool(np.any(view.mask))
 
 
 def short_fit(

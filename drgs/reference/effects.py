@@ -72,9 +72,7 @@ VIEW_MARGIN = 0.15
 """A camera samples what lies within its film, widened by this part of its size (Mip-Splatting)."""
 
 
-# ----------------------------------------------------------------------------------------------
-# Lenses
-# ----------------------------------------------------------------------------------------------
+# ---- Lenses ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -476,9 +474,7 @@ def _first_positive_root(coefficients: ArrayLike) -> float:
     return 1 / real.max() if (real > 0).any() else inf
 
 
-# ----------------------------------------------------------------------------------------------
-# Projection
-# ----------------------------------------------------------------------------------------------
+# ---- Projection ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -596,9 +592,7 @@ def _points_of_jacobian(lens: Lens, camera: Camera, points: np.ndarray) -> np.nd
     return np.hstack([np.clip(points[:, :2] / z, lower - margin, upper + margin) * z, z])
 
 
-# ----------------------------------------------------------------------------------------------
-# Images
-# ----------------------------------------------------------------------------------------------
+# ---- Images ----------------------------------------------------------------------------------
 
 
 def sh_colors(
@@ -671,9 +665,7 @@ def _mean_image(images: list[RenderedImage]) -> RenderedImage:
     return RenderedImage(**means, near_threshold=marked)
 
 
-# ----------------------------------------------------------------------------------------------
-# Cameras that move while they expose
-# ----------------------------------------------------------------------------------------------
+# ---- Cameras that move while they expose -----------------------------------------------------
 
 Pose = tuple[np.ndarray, np.ndarray]  # rotation (3, 3) world to camera, center (3,) world
 
@@ -745,9 +737,7 @@ def render_rolling_shutter(
     )
 
 
-# ----------------------------------------------------------------------------------------------
-# The 3D smoothing filter
-# ----------------------------------------------------------------------------------------------
+# ---- The 3D smoothing filter -----------------------------------------------------------------
 
 
 def smoothing_filter(
@@ -787,9 +777,7 @@ def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     return np.where(rates > 0, rates, rates[rates > 0].min(initial=inf))
 
 
-# ----------------------------------------------------------------------------------------------
-# Surfaces between the splats
-# ----------------------------------------------------------------------------------------------
+# ---- Surfaces between the splats -------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -56,9 +56,7 @@ THRESHOLD_WIDTH = 1e-6
 """Relative distance from a threshold at which single precision may decide otherwise."""
 
 
-# ----------------------------------------------------------------------------------------------
-# Types
-# ----------------------------------------------------------------------------------------------
+# ---- Types -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -157,9 +155,7 @@ class RenderedImage:
     stops: np.ndarray | None = None  # (H, W) of ``composite``: rank in depth at which it stopped
 
 
-# ----------------------------------------------------------------------------------------------
-# Gaussians in the world
-# ----------------------------------------------------------------------------------------------
+# ---- Gaussians in the world ------------------------------------------------------------------
 
 
 def quat_to_rotation(quats: np.ndarray) -> np.ndarray:
@@ -193,9 +189,7 @@ def sigmoid(logits: np.ndarray) -> np.ndarray:
     return np.exp(-np.logaddexp(0.0, -logits))
 
 
-# ----------------------------------------------------------------------------------------------
-# Colour
-# ----------------------------------------------------------------------------------------------
+# ---- Colour ----------------------------------------------------------------------------------
 
 # Normalisation of the real spherical harmonics (Condon-Shortley phase, as in 3DGS), with l the
 # degree: C_LM multiplies the polynomials of order +-m.
@@ -294,9 +288,7 @@ def unclamped_colors(
     return np.sum(colors, axis=1) + 0.5
 
 
-# ----------------------------------------------------------------------------------------------
-# Projection
-# ----------------------------------------------------------------------------------------------
+# ---- Projection ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -409,9 +401,7 @@ def _inverses(matrices: np.ndarray, dets: np.ndarray) -> np.ndarray:
     return _rows_of_matrices([[c / dets, -b / dets], [-b / dets, a / dets]])
 
 
-# ----------------------------------------------------------------------------------------------
-# Compositing
-# ----------------------------------------------------------------------------------------------
+# ---- Compositing -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -553,9 +543,7 @@ def render(
     return composite(splats, colors, background, camera.width, camera.height, threshold_width)
 
 
-# ----------------------------------------------------------------------------------------------
-# Gradients, from the pixels back to the Gaussians
-# ----------------------------------------------------------------------------------------------
+# ---- Gradients, from the pixels back to the Gaussians ----------------------------------------
 
 
 def composite_gradients(
@@ -805,9 +793,7 @@ def render_gradients(
     }
 
 
-# ----------------------------------------------------------------------------------------------
-# Small helpers
-# ----------------------------------------------------------------------------------------------
+# ---- Small helpers ---------------------------------------------------------------------------
 
 
 def _normalize(vectors: np.ndarray, fallback: tuple) -> tuple[np.ndarray, np.ndarray]:
