@@ -803,8 +803,8 @@ def render_with_surfaces(
     splats = reference.project(gaussians, camera)
     order = reference.depth_order(splats.depths, splats.visible)
     colors, depths = reference.sh_colors(gaussians, camera)[order], splats.depths[order]
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    offsets = np.stack([x, y], axis=-1) - splats.means2d[order, None, None]
+    centers = reference.pixel_centers(camera.width, camera.height)
+    offsets = centers - splats.means2d[order, None, None]
     exponents = -0.5 * np.einsum("nhwa,nab,nhwb->nhw", offsets, splats.conics[order], offsets)
     alphas = splats.opacities[order, None, None] * np.exp(exponents)
     alphas = np.minimum(np.where(alphas < reference.ALPHA_CUT, 0, alphas), reference.ALPHA_MAX)

@@ -167,7 +167,8 @@ def render(
 
     ``RenderedImage.depth`` sums the means' camera z for order ``"center"``, else that of the peaks.
     """
-    positions = pixel_centers(camera) if positions is None else np.asarray(positions, np.float64)
+    if positions is None:
+        positions = reference.pixel_centers(camera.width, camera.height)
     positions = positions if region is None else positions[region]
     background = np.asarray(background, dtype=np.float64)
     splats = _splats(gaussians, camera, model)
@@ -548,9 +549,3 @@ def _follows_closely(keys: np.ndarray, width: float) -> np.ndarray:
 def _rows(data: Rows, chosen: np.ndarray) -> Rows:
     """Return some rows; chosen: indices, or a mask (N,)."""
     return type(data)(**{name: array[chosen] for name, array in vars(data).items()})
-
-
-def pixel_centers(camera: Camera) -> np.ndarray:
-    """Return the centres (height, width, 2), px, (x, y), of the film's pixels."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    return np.stack([x, y], axis=-1)

@@ -404,9 +404,15 @@ def _inverses(matrices: np.ndarray, dets: np.ndarray) -> np.ndarray:
 # ---- Compositing -----------------------------------------------------------------------------
 
 
+def pixel_centers(width: int, height: int) -> np.ndarray:
+    """Return the centres (height, width, 2), px, (x, y), of the film's pixels."""
+    y, x = np.mgrid[:height, :width] + 0.5
+    return np.stack([x, y], axis=-1)
+
+
 @dataclass(frozen=True)
 class _Footprint:
-    """A splat on the pixels of its bounding box of h x w pixels."""
+    """A splat on h x w pixels."""
 
     offsets: np.ndarray  # (h, w, 2) d, px, from the splat's mean to the pixel centres
     falloff: np.ndarray  # (h, w) exp(-d^T A d / 2)
@@ -414,14 +420,13 @@ class _Footprint:
 
 
 def _footprint(
-    splats: Projection, i: int, box: tuple[slice, slice], period: float | None = None
+    splats: Projection, i: int, centers: np.ndarray, period: float | None = None
 ) -> _Footprint:
-    """Evaluate G(d) = exp(-d^T A d / 2) (3DGS, equation 4, on the film) in a box of pixels."""
-    y, x = np.mgrid[box] + 0.5
-    offsets = np.stack([x, y], axis=-1) - splats.means2d[i]
+    """Evaluate G(d) = exp(-d^T A d / 2) (3DGS, equation 4, on the film) at centers (h, w, 2)."""
+    offsets = centers - splats.means2d[i]
     if period is not None:
         offsets[..., 0] -= period * np.round(offsets[..., 0] / period)
-    falloff = np.exp(-0.5 * np.sum(offsets @ splats.conics[i] * offsets, axis=-1))
+    falloff = np.exp(-0.5 * np.einsum("hwi,hwi->hw", offsets @ splats.conics[i], offsets))
     return _Footprint(offsets, falloff, splats.opacities[i] * falloff)
 
 
@@ -487,7 +492,7 @@ def composite(
     never.
     """
     order = depth_order(splats.depths, splats.visible)
-    cuts = splats.all_cuts
+    centers, cuts = pixel_centers(width, height), splats.all_cuts
     boxes = _pixel_boxes(splats, order, width, height, threshold_width)
     if period is not None:
         boxes = [(rows, slice(0, width)) for rows, _ in boxes]
@@ -502,7 +507,7 @@ def composite(
     stops = np.full((height, width), never)
     near_threshold = np.zeros((height, width), dtype=bool)
     for rank, (i, box) in enumerate(zip(order, boxes, strict=True)):
-        splat = _footprint(splats, i, box, period)
+        splat = _footprint(splats, i, centers[box], period)
         alpha = np.minimum(splat.raw_alpha, ALPHA_MAX)
         unfinished = stops[box] == never
         contributes = unfinished & (alpha >= cuts[i])
@@ -582,6 +587,7 @@ def composite_gradients(
     rendered = composite(splats, colors, background, width, height)
     assert rendered.stops is not None, "composite sets it"
     order = depth_order(splats.depths, splats.visible)
+    centers, cuts = pixel_centers(width, height), splats.all_cuts
     boxes = _pixel_boxes(splats, order, width, height)
 
     d_means2d = np.zeros_like(splats.means2d)
@@ -595,9 +601,9 @@ def composite_gradients(
     suffix_sum = transmittance * (d_image @ np.asarray(background))
     for rank in reversed(range(len(order))):
         i, box = order[rank], boxes[rank]
-        splat = _footprint(splats, i, box)
+        splat = _footprint(splats, i, centers[box])
         alpha = np.minimum(splat.raw_alpha, ALPHA_MAX)
-        contributes = (rank < rendered.stops[box]) & (alpha >= splats.all_cuts[i])
+        contributes = (rank < rendered.stops[box]) & (alpha >= cuts[i])
         alpha = np.where(contributes, alpha, 0.0)
 
         transmittance[box] /= 1 - alpha
