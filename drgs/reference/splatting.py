@@ -437,20 +437,12 @@ def _pixel_boxes(
 
     opacity exp(-d^T A d / 2) >= cut is the ellipse d^T A d <= k with k = 2 ln(opacity / cut), where
     a cut is lower by ``threshold_width``; with A = cov2d^-1 its half width is sqrt(k cov2d_xx) and
-    its half height sqrt(k cov2d_yy). One pixel is added for rounding. Where inverting A would
-    cancel, the box is the whole film.
+    its half height sqrt(k cov2d_yy). One pixel is added for rounding.
     """
-    fields = splats.means2d, splats.conics, splats.opacities, splats.all_cuts
-    means2d, conics, opacities, cuts = (field[order] for field in fields)
-    cuts = cuts * (1 - threshold_width)
-    a, b, c = conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]
-    dets = a * c - b * b
-    well_conditioned = dets > 1e-9 * np.abs(a * c)
-    dets = np.where(well_conditioned, dets, 1.0)
-    k = 2 * np.log(np.maximum(opacities, cuts) / cuts)
-    variances = np.stack([c, a], axis=-1) / dets[:, None]
-    half_sizes = np.sqrt(np.maximum(k[:, None] * variances, 0.0)) + 1.0
-    half_sizes[~well_conditioned] = np.inf
+    means2d, cuts = splats.means2d[order], splats.all_cuts[order] * (1 - threshold_width)
+    k = 2 * np.log(np.maximum(splats.opacities[order], cuts) / cuts)
+    variances = np.diagonal(splats.cov2d[order], axis1=1, axis2=2)
+    half_sizes = np.sqrt(k[:, None] * variances) + 1.0
     # fmin and fmax also send a NaN to the film's border, so that the conversion is defined.
     film = np.array([width, height], dtype=np.float64)
     first = np.fmin(np.fmax(np.ceil(means2d - half_sizes - 0.5), 0.0), film).astype(int)
