@@ -27,7 +27,7 @@ axes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from math import inf, pi, sqrt
 
@@ -655,16 +655,6 @@ def _disc_points(count: int) -> np.ndarray:
     return radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def _mean_image(images: list[RenderedImage]) -> RenderedImage:
-    """Return the mean of images; a pixel that any of them marks as near a threshold is marked."""
-    means = {
-        name: np.mean([getattr(rendered, name) for rendered in images], axis=0)
-        for name in ("image", "alpha", "depth", "transmittance")
-    }
-    marked = np.any([rendered.near_threshold for rendered in images], axis=0)
-    return RenderedImage(**means, near_threshold=marked)
-
-
 # ---- Cameras that move while they expose -----------------------------------------------------
 
 Pose = tuple[np.ndarray, np.ndarray]  # rotation (3, 3) world to camera, center (3,) world
@@ -703,15 +693,26 @@ def render_motion_blur(
     lens: Lens = Pinhole(),
     threshold_width: float = reference.THRESHOLD_WIDTH,
 ) -> RenderedImage:
-    """Return the mean of n = num_samples images, at the times (k + 0.5) / n of the exposure."""
-    times = (np.arange(num_samples) + 0.5) / num_samples
-    cameras = [camera_at(camera_open, camera_close, t) for t in times]
-    return _mean_image(
-        [
-            render(gaussians, camera, lens, background, threshold_width=threshold_width)
-            for camera in cameras
-        ]
-    )
+    """Return the mean of n = num_samples images, at the times (k + 0.5) / n of the exposure.
+
+    A pixel that any of them marks as near a threshold is marked.
+    """
+    images = [
+        render(
+            gaussians,
+            camera_at(camera_open, camera_close, (k + 0.5) / num_samples),
+            lens,
+            background,
+            threshold_width=threshold_width,
+        )
+        for k in range(num_samples)
+    ]
+    means = {
+        name: np.mean([getattr(rendered, name) for rendered in images], axis=0)
+        for name in ("image", "alpha", "depth", "transmittance")
+    }
+    marked = np.any([rendered.near_threshold for rendered in images], axis=0)
+    return RenderedImage(**means, near_threshold=marked)
 
 
 def render_rolling_shutter(
@@ -729,12 +730,8 @@ def render_rolling_shutter(
         )
         for j in range(height)
     ]
-    return RenderedImage(
-        **{
-            field.name: np.stack([getattr(p, field.name)[j] for j, p in enumerate(images)])
-            for field in fields(RenderedImage)
-        }
-    )
+    rows = ([field[j] for field in vars(rendered).values()] for j, rendered in enumerate(images))
+    return RenderedImage(*map(np.stack, zip(*rows, strict=True)))
 
 
 # ---- The 3D smoothing filter -----------------------------------------------------------------
