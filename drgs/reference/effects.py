@@ -33,7 +33,7 @@ from math import inf, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
@@ -452,8 +452,12 @@ def _first_fold(lens: OpenCV | ThinPrismFisheye, radius: float) -> float:
     folded = np.flatnonzero(lens.least_eigenvalue(radii) <= 0)
     if len(folded) == 0:
         return radius
+
+    def least_eigenvalue(r: float) -> float:
+        return lens.least_eigenvalue(np.array([r]))[0]
+
     between = radii[folded[0] - 1], radii[folded[0]]
-    return brentq(lambda r: lens.least_eigenvalue(np.array([r]))[0], *between, xtol=1e-15)
+    return float(root_scalar(least_eigenvalue, bracket=between, xtol=1e-15).root)
 
 
 def _film_border(camera: Camera) -> np.ndarray:
