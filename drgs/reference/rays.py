@@ -96,9 +96,7 @@ class ImageModel:
     order: Literal["center", "pixel", "entry"] = "center"
     sh_direction: Literal["mean", "pixel"] = "mean"
     stop: Literal["before", "after"] = "before"
-    alpha_max: float = Field(
-        default=reference.ALPHA_MAX, gt=0, le=1
-    )  # upper clamp of alpha; 1: none
+    alpha_max: float = Field(default=reference.ALPHA_MAX, gt=0, le=1)  # upper clamp; 1: none
     alpha_cut: float = Field(default=reference.ALPHA_CUT, ge=0, lt=1)  # smaller: does not exist
     transmittance_stop: float = Field(default=reference.TRANSMITTANCE_STOP, ge=0, lt=1)  # 0: none
     extent: float = Field(default=inf, gt=0)  # standard deviations of a splat
