@@ -75,7 +75,7 @@ def make_environment(wheel, folder):
     run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder)
     scripts = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
     python = scripts / f"python{sysconfig.get_config_var('EXE') or ''}"
-    install(wheel, python)
+    install_for(wheel, python)
     # The dependencies are this environment's, and come last. Its own .pth files, such as that of
     # an editable drgs, are not read there.
     where = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder)
@@ -221,7 +221,7 @@ def test_external_package_can_use_every_extension_point(scripts, photographs):
     """A strategy, effect, loss, term, lens, falloff, file format and reader; no file of drgs."""
     folder = photographs
     source = shutil.copytree(REPOSITORY / "examples", folder / "source")
-    install(build_wheel(source, folder), scripts / "python")
+    install_for(build_wheel(source, folder), scripts / "python")
     shutil.rmtree(source)
     (folder / "fit.yml").write_text(CONFIGURATION)
     shown = run(scripts / "drgs", "fit", "fit.yml", "--out", "out", cwd=folder)
