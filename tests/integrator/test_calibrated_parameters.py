@@ -81,10 +81,7 @@ LENS_NAMES = (
 )
 
 REFUSED = [
-    (
-        {"lens": "opencvv"},
-        f'lens: no lens is called "opencvv"; did you mean opencv?; {LENS_NAMES}',
-    ),
+    ({"lens": "opencvv"}, f'lens: no lens is called "opencvv"; did you mean opencv?; {LENS_NAMES}'),
     ({"lens": 3}, f'lens: no lens is called "3"; {LENS_NAMES}'),
     ({"lens": "fisheye", "k5": 0.1}, "lens 'fisheye' has the coefficients k1, k2, k3, k4, got k5"),
     ({"k1": 0.1}, "lens 'pinhole' has no coefficients, got k1"),

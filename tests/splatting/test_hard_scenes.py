@@ -126,12 +126,7 @@ def most_important_row(case) -> int:
 
 @both_precisions
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("log_scales", -np.inf),
-        ("logit_opacities", np.inf),
-        ("sh0", -np.inf),
-    ],
+    ("name", "value"), [("log_scales", -np.inf), ("logit_opacities", np.inf), ("sh0", -np.inf)]
 )
 def test_meaningful_infinities_are_rendered_as_limits(precision, name, value):
     """The limit of large numbers: the image is that of -1e4 (or 1e4), to the last bit."""

@@ -23,10 +23,7 @@ from drgs.splatting import rendering
 
 
 def gsplat_frame(scene, precision):
-    gaussians, camera = (
-        device_gaussians(scene[0], precision),
-        device_camera(scene[1], precision),
-    )
+    gaussians, camera = (device_gaussians(scene[0], precision), device_camera(scene[1], precision))
     frame = rendering.render(gaussians, camera, rendering.Pipeline(3))
     height, width = scene[1].height, scene[1].width
     planes = np.stack([rows(plane).reshape(height, width) for plane in frame.planes()], axis=-1)
