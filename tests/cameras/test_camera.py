@@ -1,27 +1,14 @@
 """The camera of a Mitsuba sensor against the rays that the sensor itself samples."""
 
-from dataclasses import replace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from support.kernels import kernel_hashes
-from support.sensors import PIXELS, camera_of, numbers, points_on_rays, project
+from support.sensors import camera_of, numbers
 from support.views import VIEWS, View, pose
 
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
-
-
-@pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
-def test_points_on_sensor_rays_project_to_their_pixels(view):
-    sensor = mi.load_dict(view.sensor())
-    points, expected = points_on_rays(sensor)
-    camera = camera_of(sensor)
-    assert np.abs(project(camera, points) - expected).max() < PIXELS
-    rows, columns = view.window
-    size = columns.stop - columns.start, rows.stop - rows.start
-    assert (camera.width, camera.height) == size
 
 
 def test_a_camera_far_from_the_origin_keeps_its_centre():
@@ -30,25 +17,6 @@ def test_a_camera_far_from_the_origin_keeps_its_centre():
     view = View("far", to_world=pose([0.3, -1.0, 0.5], 40, position))
     camera = numbers(camera_of(mi.load_dict(view.sensor())))
     assert np.array_equal(camera["center"], position)
-
-
-@pytest.mark.parametrize("near, near_clip", [(0.25, 0.5), (0.5, 0.25)])
-def test_larger_of_two_near_planes_is_used(near, near_clip):
-    sensor = mi.load_dict(replace(VIEWS[1], near_clip=near_clip).sensor())
-    assert numbers(camera_of(sensor, near))["near"] == 0.5
-
-
-def test_a_camera_follows_its_sensor():
-    view, other = View("before"), View("after", fov=35.0, to_world=pose([1, 2, 3], 80, (1, 2, 3)))
-    sensor = mi.load_dict(view.sensor())
-    params = mi.traverse(sensor)
-    params["x_fov"] = other.fov
-    params["to_world"] = mi.load_dict(other.sensor()).world_transform()
-    params["film.crop_size"], params["film.crop_offset"] = [11, 9], [5, 3]
-    params.update()
-    expected = mi.load_dict(replace(other, crop=(5, 3, 11, 9)).sensor())
-    points, positions = points_on_rays(expected)
-    assert np.abs(project(camera_of(sensor), points) - positions).max() < PIXELS
 
 
 def test_unsupported_sensors_are_refused_by_name():

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import drjit as dr
-import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -202,25 +201,3 @@ def test_shipped_model_is_the_output_of_its_program(monkeypatch):
             np.testing.assert_allclose(getattr(made, name), getattr(shipped, name), atol=1e-5)
     cosines = np.sum(made.quats * shipped.quats, axis=1)
     np.testing.assert_allclose(np.abs(cosines), 1, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_shipped_scene_is_compared_with_volprim(monkeypatch, tmp_path, capsys):
-    """On a film so small that the low-pass of 0.3 px^2 shows: 24 dB; a mirrored one has 10."""
-    monkeypatch.syspath_prepend(SCENES)
-    import compare_shapes
-
-    monkeypatch.setattr(compare_shapes, "REPEATS", {"volprim_rf_basic": 1, "splats": 1})
-    model = str(SCENES / "shapes" / "knot.ply")
-    for arguments in ([], [model]):
-        options = [*arguments, "--size", "48", "--out", str(tmp_path / "shapes.png")]
-        monkeypatch.setattr("sys.argv", ["compare_shapes.py", *options])
-        compare_shapes.main()
-        lines = capsys.readouterr().out.splitlines()
-        assert [line.partition(":")[0] for line in lines[1:4]] == [
-            "volprim_rf_basic",
-            "splats",
-            "ratio of the times",
-        ]
-        assert float(lines[4].removesuffix(" dB").rpartition(" ")[2]) > 20
-        assert iio.imread(tmp_path / "shapes.png").shape[:2] > (300, 600)

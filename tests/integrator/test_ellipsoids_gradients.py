@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -16,9 +14,9 @@ from support.ellipsoids import (
     held_gradients,
     shape_of,
 )
-from support.helpers import clear, single
+from support.helpers import clear
 from support.kernels import float_reductions
-from support.views import image_of, tensors
+from support.views import image_of
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.integrator import parts
@@ -105,24 +103,3 @@ def test_a_changed_parameter_is_rendered_again(name, counted):
     np.testing.assert_array_equal(
         after, image_of(scene.load_with(objects={"shape": shape_of(held)}))
     )
-
-
-def test_changed_integrator_parameter_is_rendered_again():
-    scene = Merged()
-    loaded = scene.load()
-    image_of(loaded)
-    params = mi.traverse(loaded)
-    params["integrator.means"] = params["integrator.means"] + 0.25
-    params.update()
-    moved = replace(scene.own, means=single(scene.own.means + 0.25))
-    np.testing.assert_array_equal(image_of(loaded), image_of(scene.load_with(**tensors(moved))))
-
-
-def test_integrator_renders_the_shapes_of_the_current_scene():
-    first, second = EllipsoidsCase(), EllipsoidsCase(seed=9)
-    scenes = [scene.load() for scene in (first, second)]
-    expected = [image_of(loaded) for loaded in scenes]
-    integrator = mi.load_dict(first.settings)
-    for _ in range(2):
-        for loaded, image in zip(scenes, expected, strict=True):
-            np.testing.assert_array_equal(image_of(loaded, integrator=integrator), image)

@@ -1,7 +1,5 @@
 """Caches of the ``splats`` integrator, its parameters, and that its bytes repeat."""
 
-import gc
-import weakref
 from dataclasses import replace
 
 import drjit as dr
@@ -72,15 +70,6 @@ def renderings(monkeypatch):
 
     monkeypatch.setattr(rendering, "render", counting)
     return calls
-
-
-def test_later_images_and_backward_passes_reuse_the_frame(renderings):
-    scene = Scene()
-    loaded = scene.load()
-    for _ in range(2):
-        mi.render(loaded)
-    gradients_of(loaded, scene.weights())
-    assert len(renderings) == 1
 
 
 POSE = VIEWS[2].to_world
@@ -161,18 +150,6 @@ def test_a_changed_background_needs_no_new_frame(renderings):
     assert len(renderings) == 1
     changed = replace(scene, background=(0.375, 0.875, 0.0625))
     assert np.array_equal(after, fresh_image(changed))
-
-
-@pytest.mark.slow
-def test_a_stale_frame_is_not_kept():
-    loaded = Scene().load()
-    mi.render(loaded)
-    frame = weakref.ref(loaded.integrator().state.cache.kept["frames 0"].value[0][0])
-    params = mi.traverse(loaded)
-    params["integrator.means"] = params["integrator.means"] + 1
-    params.update()
-    gc.collect()
-    assert frame() is None
 
 
 def test_backward_pass_leaves_no_autodiff_graph():

@@ -21,14 +21,6 @@ def numbers(camera) -> dict[str, np.ndarray]:
     return {n: np.array(getattr(camera, n)).astype(np.float64)[..., 0] for n in names}
 
 
-def project(camera, points) -> np.ndarray:
-    """Film positions (N, 2) in px of world points (N, 3)."""
-    c = numbers(camera)
-    x, y, z = c["rotation"] @ (points - c["center"]).T
-    assert (z > 0).all(), "points that the sensor sees must lie before the camera"
-    return np.stack([x, y], axis=-1) / z[:, None] * c["focal"] + c["principal"]
-
-
 def points_on_rays(sensor) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3) on the sensor's rays, and the film positions (N, 2) in px of the rays."""
     rng = np.random.default_rng(3)
