@@ -23,7 +23,7 @@ from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye as CameraThinPrismFisheye
 from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.reference.effects import Fisheye, OpenCV, Orthographic, ThinPrismFisheye
+from drgs.reference.effects import Fisheye, OpenCV, ThinPrismFisheye
 
 # ----------------------------------------------------------------------------------------------
 # Visibility
@@ -192,27 +192,6 @@ def rays_of(camera, lens, film, precision) -> np.ndarray:
     rays = rows(device.lens.ray(device, x, y))
     rays = np.broadcast_to(rays, (len(film), 3))
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
-
-
-@both_precisions
-@every_lens
-def test_points_of_a_ray_project_to_its_pixel(precision, name):
-    """The reference projects points of rays, wherever the lens shows anything."""
-    lens, camera = LENSES[name], camera_behind(LENSES[name])
-    y, x = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
-    film = np.column_stack([x, y])
-    film = np.vstack([film, [[camera.cx, camera.cy]]])
-    points = points_at(lens, camera, film, np.ones(len(film)))
-    if isinstance(lens, Orthographic):
-        points = np.tile([0, 0, 1.0], (len(film), 1))
-    shown = ~np.isnan(points).any(axis=1)
-    assert shown.all() == (name != "barrel")
-    rays = rays_of(camera, lens, film, precision)
-    assert np.isfinite(rays).all()
-    expected = points / np.linalg.norm(points, axis=1, keepdims=True)
-    # The reciprocal of the slope of the distorted radius, next to the fold, times a rounding.
-    tolerance = {FLOAT64: 1e-12, FLOAT32: 2e-5}[precision]
-    np.testing.assert_allclose(rays[shown], expected[shown], rtol=0, atol=tolerance)
 
 
 @pytest.mark.slow

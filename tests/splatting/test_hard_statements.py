@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import drjit as dr
 import numpy as np
 import pytest
 from support.hard_cases import FAMILIES, PLANES, camera_for, cotangents_of, splats
@@ -11,14 +12,19 @@ from support.helpers import (
     Case,
     Cotangents,
     both_precisions,
+    device_camera,
+    device_gaussians,
     image_planes,
     kernel_gradients,
     reference_gradients,
     render,
+    rows,
     single,
 )
+from support.reference_scenes import needle
 
 from drgs.reference import splatting as reference
+from drgs.splatting.projection import compensated_opacity, load_rows, plain_opacity, project
 
 
 def test_means_at_the_near_plane_are_drawn_and_nearer_ones_are_not():
@@ -83,3 +89,16 @@ def test_a_colour_of_zero_keeps_its_gradient(precision):
     expected = 0.5 * reference.C_00 * np.array([1.0, 0.5, 0.25])
     gradient = kernel_gradients(case, precision, weights)["sh0"][0, 0]
     np.testing.assert_allclose(gradient, expected, rtol=1e-6)
+
+
+@both_precisions
+def test_a_splat_without_area_is_invisible_when_compensated(precision):
+    gaussians, camera = needle([0.0, -80.0, -80.0])
+    camera = device_camera(camera, precision)
+    parameter_rows = load_rows(device_gaussians(gaussians, precision), 0)
+    assert project(parameter_rows, camera, 0, plain_opacity).visible[0]
+    dr.enable_grad(parameter_rows)
+    splats_2d = project(parameter_rows, camera, 0, compensated_opacity)
+    assert not splats_2d.visible[0] and splats_2d.opacities[0] == 0
+    dr.backward(splats_2d.opacities)
+    assert not rows(dr.grad(parameter_rows.log_scales)).any()

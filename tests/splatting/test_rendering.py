@@ -1,6 +1,4 @@
-"""Features, attached parameters, visibility and weights of whole images."""
-
-from functools import cache
+"""Features and weights of whole images."""
 
 import drjit as dr
 import numpy as np
@@ -9,17 +7,11 @@ from support.helpers import (
     FLOAT32,
     FLOAT64,
     Case,
-    Cotangents,
     assert_arrays_agree,
     both_precisions,
     clear,
-    device_camera,
-    device_gaussians,
     frame_adjoint,
-    plane_cotangents,
-    reference_gradients,
     render,
-    rows,
 )
 
 from drgs.accuracy.pipeline import pipeline_of
@@ -41,11 +33,6 @@ IMAGE = {FLOAT64: 1e-12, FLOAT32: 2e-5}
 GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 
 CASE = Case("degree 3", 37, 29, 3)
-
-
-@cache
-def expected_gradients(case) -> dict[str, np.ndarray]:
-    return reference_gradients(case, Cotangents.random(case))
 
 
 @both_precisions
@@ -88,41 +75,6 @@ def test_features_are_composited_in_the_given_order(precision, features):
         {name: np.array(getattr(wanted, name)) for name in PARAMETER_NAMES},
         GRADIENTS[precision],
     )
-
-
-@both_precisions
-def test_attached_parameters_are_detached(precision):
-    """``mi.render`` does the same: gradients are suspended while attached parameters are given."""
-    case = clear(CASE)
-    gaussians = device_gaussians(case.gaussians, precision)
-    dr.enable_grad(gaussians)
-    with dr.suspend_grad():
-        camera = device_camera(case.camera, precision)
-        frame = rendering.render(gaussians, camera, case.pipeline)
-        cotangents = plane_cotangents(case, Cotangents.random(case), precision)
-        gradients = frame_adjoint(gaussians, frame, *cotangents)
-    assert_arrays_agree(
-        {name: np.array(getattr(gradients.parameters, name)) for name in PARAMETER_NAMES},
-        {name: expected_gradients(case)[name] for name in PARAMETER_NAMES},
-        GRADIENTS[precision],
-    )
-    assert not any(np.array(dr.grad(getattr(gaussians, name))).any() for name in PARAMETER_NAMES)
-
-
-@both_precisions
-def test_splats_overlapping_the_film_are_visible(precision):
-    case = clear(CASE)
-    gaussians, frame = render(case, precision)
-    gradients = frame_adjoint(
-        gaussians, frame, *plane_cotangents(case, Cotangents.random(case), precision)
-    )
-    visible = np.array(gradients.visible)
-    assert 0 < visible.sum() < len(visible)
-    in_front = reference.project(*case.scene).visible
-    assert not (visible & ~in_front).any() and (in_front & ~visible).any()
-    touched = expected_gradients(case)["means2d"].any(axis=1)
-    assert visible[touched].all()
-    assert not rows(gradients.means2d)[~visible].any()
 
 
 @pytest.mark.parametrize("sh_direction", ["mean", "pixel"])
