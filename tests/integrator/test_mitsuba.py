@@ -23,7 +23,7 @@ from support.calibrated_sensors import (
 )
 from support.helpers import clear
 from support.openexr import read_exr
-from support.sensors import PIXELS, camera_of, numbers, points_on_rays
+from support.sensors import camera_of, numbers
 from support.splats_checks import GRADIENTS, IMAGE
 from support.splats_checks import XYZ as TO_XYZ
 from support.views import Scene, View, gradient, image_of, tensors
@@ -102,24 +102,6 @@ def test_depth_of_a_plane_matches_rays_for_every_sensor(name):
     assert np.ptp(expected) > 0.1 and (image[..., 5] == 1).all()
     # Positions of up to 10 units in float32, seen along rays that are 30 degrees off the normal.
     np.testing.assert_allclose(image[..., 4], expected, rtol=2e-5)
-
-
-@pytest.mark.parametrize("crop", [None, WINDOW])
-@pytest.mark.parametrize(
-    ("kind", "to_world"),
-    [("thinlens", m) for m in POSES.values()]
-    + [("orthographic", m) for m in (POSES | SCALED).values()],
-    ids=[f"thinlens, {n}" for n in POSES] + [f"orthographic, {n}" for n in POSES | SCALED],
-)
-def test_points_on_rays_project_to_their_pixels(kind, to_world, crop):
-    """Rays go through the middle of the aperture."""
-    sensor = mi.load_dict(own_sensor(kind, View("", 53, 41, crop=crop, to_world=to_world)))
-    points, expected = points_on_rays(sensor)
-    c = numbers(camera_of(sensor))
-    x, y, z = c["rotation"] @ (points - c["center"]).T
-    film = np.stack([x, y], axis=-1) / (z[:, None] if kind == "thinlens" else 1)
-    assert (z > 0).all()
-    assert np.abs(film * c["focal"] + c["principal"] - expected).max() < PIXELS
 
 
 @pytest.mark.parametrize("to_world", POSES.values(), ids=POSES)

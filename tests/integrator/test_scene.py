@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.helpers import NEAR_THRESHOLD, assert_arrays_agree
-from support.sensors import camera_of, numbers, points_on_rays
+from support.sensors import camera_of, numbers
 from support.viewer_rendering import VIEWER_RENDERING
 from support.views import View as Perspective
 from support.views import image_of, pose, splats_before
@@ -61,15 +61,6 @@ def test_sensor_of_a_moving_view_has_the_configured_shutter_samples(samples):
     assert sensor.shutter_samples == expected
     state = read_sensor(sensor, 0.0)
     assert len(cameras_in_time(camera_from_sensor(state))) == expected
-
-
-def test_sensor_rays_match_the_view():
-    """Independent of the integrator's reading of a sensor."""
-    view = make_view()
-    points, positions = points_on_rays(make_sensors([view])[0])
-    x, y, z = view.camera_to_world[:3, :3].T @ (points - view.center).T
-    film = np.stack([view.fx * x / z + view.cx, view.fy * y / z + view.cy], axis=-1)
-    assert np.abs(film - positions).max() < 5e-5
 
 
 def test_views_of_one_size_share_a_film():

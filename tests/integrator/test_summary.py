@@ -22,18 +22,15 @@ from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import format_effects, summary_of_sensors, summary_of_views
 from drgs.training.effects.base import integrator_settings, training_effects
 
-MODULES = (
-    "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
-    "cameras.radial_tangential",
-    "cameras.thin_prism_fisheye", "effects.defocus", "effects.occlusion",
-    "effects.smoothing", "gaussians.rotation", "gaussians.similarity", "integrator.parts",
-    "integrator.light.splat_transport", "integrator.light.shadows",
-    "integrator.light.surfaces",
-    "light", "light.grid", "light.probe", "light.walk",
-    "training.effects.background", "training.effects.cameras", "training.effects.colors",
-    "training.effects.depth", "training.effects.masks", "training.effects.photometry",
-    "training.effects.smoothing", "training.effects.view_parameters",
-)  # fmt: skip
+MODULES = """
+    cameras.distortion cameras.fisheye cameras.motion cameras.orthographic cameras.radial_tangential
+    cameras.thin_prism_fisheye effects.defocus effects.occlusion effects.smoothing
+    gaussians.rotation gaussians.similarity integrator.parts integrator.light.splat_transport
+    integrator.light.shadows integrator.light.surfaces light light.grid light.probe light.walk
+    training.effects.background training.effects.cameras training.effects.colors
+    training.effects.depth training.effects.masks training.effects.photometry
+    training.effects.smoothing training.effects.view_parameters
+"""
 """Modules used only by effects."""
 
 
@@ -243,98 +240,71 @@ from support.viewer_rendering import VIEWER_RENDERING
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 
-plain = capture.make_dataset(2, 1)
-ones = np.ones((capture.HEIGHT, capture.WIDTH), np.float32)
-
-def dataset(**extras):
-    return replace(plain, train=tuple(replace(view, **extras) for view in plain.train))
-
-make_trainer().step()
-found, known = {{"a plain fit": sorted(set(sys.modules) & set({modules!r}))}}, set()
-for name, extras, changes in (
-    ("nothing", {{}}, {{}}),
-    ("smoothing", {{}}, {{"model.smoothing": True}}),
-    ("masks", {{"mask": ones}}, {{}}),
-    ("colors", {{}}, {{"colors.lr": 0.1}}),
-    ("photometry", {{}}, {{"colors.vignetting_lr": 0.1}}),
-    ("cameras", {{}}, {{"cameras.optimise": True}}),
-):
+def plan(mask=None, **changes):
+    plain = capture.make_dataset(2, 1)
+    dataset = replace(plain, train=tuple(replace(view, mask=mask) for view in plain.train))
+    changes = {{key.replace("__", "."): value for key, value in changes.items()}}
     config = with_changes(FitConfig(data={{"path": "."}}), changes)
-    summary_of_fit(config, dataset(**extras))
-    training_effects(config, dataset(**extras))
-    now = set(sys.modules) & set({modules!r})
-    found[name] = sorted(now - known)
-    known |= now
+    summary_of_fit(config, dataset)
+    training_effects(config, dataset)
 
-def sensor(**settings):
+def show(objects=(), kind="perspective", sensor=(), **settings):
     film = {{"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {{"type": "box"}}}}
-    return {{"film": film, **settings}}
-
-capture.blobs().save({ply!r})
-aperture = {{"aperture_radius": 0.1, "focus_distance": 2.0}}
-plain, ball = {{"sensor": sensor(type="perspective")}}, {{"ball": {{"type": "sphere"}}}}
-lit = {{"sky": {{"type": "constant"}}, **ball}}
-for name, scene, settings in (
-    ("calibrated", {{"sensor": sensor(type="calibrated")}}, {{}}),
-    ("perspective", plain, {{"light": "none"}}),
-    ("light without surfaces", plain, {{"light": "rays"}}),
-    ("environment", plain | {{"sky": {{"type": "constant"}}}}, {{}}),
-    ("distorted", {{"sensor": sensor(type="calibrated", lens="opencv", k1=0.1)}}, {{}}),
-    ("thin lens", {{"sensor": sensor(type="thinlens", **aperture)}}, {{}}),
-    ("orthographic", {{"sensor": sensor(type="orthographic")}}, {{}}),
-    ("surface", plain | lit, {{"light": "none"}}),
-    ("path", plain | lit, {{"nested": {{"type": "path"}}}}),
-    ("splatpath", plain | lit, {{"nested": {{"type": "splatpath"}}}}),
-    ("light", plain | lit, {{"light": "rays"}}),
-    ("shadows", plain | lit, {{"shadows": "ball"}}),
-    ("object in its place", plain, {{"to_world": mi.ScalarTransform4f().scale(2)}}),
-):
+    sensor = {{"type": kind, "film": film, **dict(sensor)}}
     integrator = {{"type": "splats", "filename": {ply!r}, **settings}}
-    mi.render(mi.load_dict({{"type": "scene", "integrator": integrator, **scene}}), spp=1)
+    scene = {{"type": "scene", "integrator": integrator, "sensor": sensor, **dict(objects)}}
+    mi.render(mi.load_dict(scene), spp=1)
+
+ones = np.ones((capture.HEIGHT, capture.WIDTH), np.float32)
+aperture = {{"aperture_radius": 0.1, "focus_distance": 2.0}}
+sky = {{"sky": {{"type": "constant"}}}}
+lit = {{**sky, "ball": {{"type": "sphere"}}}}
+capture.blobs().save({ply!r})
+found, known = [], set()
+for step in {steps!r}:
+    eval(step)
     now = set(sys.modules) & set({modules!r})
-    found[name] = sorted(now - known)
+    found.append(sorted(now - known))
     known |= now
 print(json.dumps(found))
 """
 
+STEPS = {
+    "make_trainer().step()": "",
+    "plan()": "",
+    "plan(model__smoothing=True)": "effects.smoothing training.effects.smoothing",
+    "plan(mask=ones)": "training.effects.masks",
+    "plan(colors__lr=0.1)": "training.effects.colors training.effects.view_parameters",
+    "plan(colors__vignetting_lr=0.1)": "training.effects.photometry",
+    "plan(cameras__optimise=True)": "cameras.motion training.effects.cameras",
+    "show(kind='calibrated')": "",
+    "show(light='none')": "",
+    "show(light='rays')": "",  # without surfaces
+    "show(sky)": "",
+    "show(kind='calibrated', sensor={'lens': 'opencv', 'k1': 0.1})": (
+        "cameras.distortion cameras.radial_tangential"
+    ),
+    "show(kind='thinlens', sensor=aperture)": "effects.defocus",
+    "show(kind='orthographic')": "cameras.orthographic",
+    "show(lit, light='none')": "effects.occlusion integrator.light.surfaces",
+    "show(lit, nested={'type': 'path'})": "",
+    "show(lit, nested={'type': 'splatpath'})": "",
+    "show(lit, light='rays')": (
+        "integrator.light.splat_transport light light.grid light.probe light.walk"
+    ),
+    "show(lit, shadows='ball')": "integrator.light.shadows",
+    "show(to_world=mi.ScalarTransform4f().scale(2))": (
+        "gaussians.rotation gaussians.similarity integrator.parts"
+    ),
+}
+"""Expressions, and the modules that each imports besides those of the expressions before."""
+
 
 @pytest.mark.slow
 def test_each_effect_imports_its_own_modules(run_python, tmp_path):
-    """In this order, what comes later knows what came before."""
-    program = IMPORTS.format(
-        tests=TESTS, modules=[f"drgs.{name}" for name in MODULES], ply=str(tmp_path / "blobs.ply")
-    )
-    result = run_python(program)
+    modules, steps = [f"drgs.{name}" for name in MODULES.split()], [*STEPS]
+    ply = str(tmp_path / "blobs.ply")
+    result = run_python(IMPORTS.format(tests=TESTS, modules=modules, ply=ply, steps=steps))
     assert result.returncode == 0, result.stderr
-    assert json.loads(result.stdout) == {
-        "a plain fit": [],
-        "nothing": [],
-        "smoothing": ["drgs.effects.smoothing", "drgs.training.effects.smoothing"],
-        "masks": ["drgs.training.effects.masks"],
-        "colors": ["drgs.training.effects.colors", "drgs.training.effects.view_parameters"],
-        "photometry": ["drgs.training.effects.photometry"],
-        "cameras": ["drgs.cameras.motion", "drgs.training.effects.cameras"],
-        "calibrated": [],
-        "perspective": [],
-        "light without surfaces": [],
-        "environment": [],
-        "distorted": ["drgs.cameras.distortion", "drgs.cameras.radial_tangential"],
-        "thin lens": ["drgs.effects.defocus"],
-        "orthographic": ["drgs.cameras.orthographic"],
-        "surface": ["drgs.effects.occlusion", "drgs.integrator.light.surfaces"],
-        "path": [],
-        "splatpath": [],
-        "light": [
-            "drgs.integrator.light.splat_transport",
-            "drgs.light",
-            "drgs.light.grid",
-            "drgs.light.probe",
-            "drgs.light.walk",
-        ],
-        "shadows": ["drgs.integrator.light.shadows"],
-        "object in its place": [
-            "drgs.gaussians.rotation",
-            "drgs.gaussians.similarity",
-            "drgs.integrator.parts",
-        ],
-    }
+    found = dict(zip(steps, json.loads(result.stdout), strict=True))
+    assert found == {k: [f"drgs.{name}" for name in v.split()] for k, v in STEPS.items()}

@@ -122,8 +122,6 @@ def test_infinite_logits_become_opacities_distinct_from_0_and_1(tmp_path):
     assert np.finfo(np.float32).tiny <= loaded.opacities[2] < 1e-37
 
 
-
-
 @pytest.mark.parametrize(
     "values",
     [
