@@ -1,7 +1,6 @@
 """Several samples per pixel: kernels against the reference, films against the definition."""
 
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 from support.backgrounds import CLOSE, EMITTERS, rendered, texels
 from support.cases import CASES, MODEL_FIELDS, planes_of, reference_camera
-from support.helpers import FLOAT64, NEAR_THRESHOLD, single
+from support.helpers import FLOAT64, NEAR_THRESHOLD
 from support.views import VIEWS, Scene, image_of, side_by_side, tensors
 from support.wall_scenes import Wall
 from support.wall_scenes import load as load_wall
@@ -260,29 +259,6 @@ def test_a_box_filter_gives_the_same_bytes_in_every_run():
         dr.backward(dr.sum(dr.square(image), axis=None))
         results.append([np.array(image), np.array(dr.grad(params["integrator.means"]))])
     assert all(a.tobytes() == b.tobytes() for a, b in zip(*results, strict=True))
-
-
-def test_more_samples_converge_to_the_pixel_area():
-    """Splats smaller than a pixel, no low-pass: a pixel is the mean over its area. Errors of
-    stratified samples fall at least as 1 / sqrt(n).
-    """
-    gaussians = SCENE.gaussians
-    small = replace(gaussians, log_scales=single(gaussians.log_scales - 2.5))
-    settings = SCENE.settings | {"low_pass": 0.0}
-
-    def image(samples, seed):
-        loaded = mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": settings | tensors(small),
-                "sensor": SCENE.view.sensor(samples=samples, sampler="stratified"),
-            }
-        )
-        return image_of(loaded, seed=seed)
-
-    exact = image(256, 1)
-    errors = [np.sqrt(np.mean((image(n, 2) - exact) ** 2)) for n in (1, 4, 16, 64)]
-    assert all(after < 0.7 * before for before, after in pairwise(errors)), errors
 
 
 # ----------------------------------------------------------------------------------------------

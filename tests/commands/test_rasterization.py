@@ -328,7 +328,10 @@ REFUSED = [
     ({"render_mode": "depth"}, "render_mode must be one of .*, got 'depth'"),
     ({"width": 0}, "width and height must be 1 px or more"),
     ({"width": 10**6, "height": 10**6}, r"width and height must be smaller: .* too many"),
-    ({**FLAT, "colors": np.ones((24, 2000))}, "colors must be of at most 64 channels, got 2000"),
+    (
+        {**FLAT, "colors": np.ones((24, 2000)), "backgrounds": None},
+        "colors must be of at most 64 channels, got 2000",
+    ),
     ({"eps2d": -1.0}, "eps2d must be finite and not negative, got -1.0"),
     ({"projection": "affine"}, "projection must be one of ewa, unscented, exact"),
     ({"packed": False}, "packed is a parameter of gsplat's .*; leave it out"),
