@@ -9,7 +9,7 @@ In float32, every pixel and every single derivative may be wrong by
     30 (noise + 2^-24 sqrt(1 + n / 25) |value|)
 
 where *noise* is what the problem's conditioning turns one rounding everywhere into (see
-``conditioning.py``), and n the number of Gaussians. 30 is lambda sqrt(k): between two places
+``support/hard_cases.py``), and n the number of Gaussians. 30 is lambda sqrt(k): between two places
 where the model rounds once, a kernel makes at most some k = 25 roundings (from quaternion and
 scales to M, M M^T, its determinant and the factor of its inverse; from a pixel's offset to alpha;
 in the sums over the 16 pixels of a micro-tile and the micro-tiles of a splat), and lambda = 6 is
