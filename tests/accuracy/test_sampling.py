@@ -9,7 +9,7 @@ import pytest
 from support.backgrounds import CLOSE, EMITTERS, rendered, texels
 from support.cases import CASES, MODEL_FIELDS, planes_of, reference_camera
 from support.helpers import FLOAT64, NEAR_THRESHOLD
-from support.views import VIEWS, Scene, image_of, side_by_side, tensors
+from support.views import VIEWS, Scene, image_of, side_by_side
 from support.wall_scenes import Wall
 from support.wall_scenes import load as load_wall
 
@@ -268,10 +268,7 @@ def test_a_box_filter_gives_the_same_bytes_in_every_run():
 SMALL_SCENE = Scene(count=12, degree=1)
 
 
-def scene_with(settings=(), sensor=None, **objects):
-    integrator = SMALL_SCENE.settings | tensors(SMALL_SCENE.gaussians) | dict(settings)
-    sensor = SMALL_SCENE.view.sensor() if sensor is None else sensor
-    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **objects})
+scene_with = SMALL_SCENE.load_with
 
 
 def batch_of_two():
@@ -295,22 +292,22 @@ def feature_tensor(channels):
 
 
 SCENES = {
-    "plain": lambda: scene_with(),
-    "linear, antialiased": lambda: scene_with({"srgb_primitives": True, "antialiased": True}),
-    "exact, order of each pixel": lambda: scene_with({"projection": "exact", "order": "pixel"}),
+    "plain": scene_with,
+    "linear, antialiased": lambda: scene_with(srgb_primitives=True, antialiased=True),
+    "exact, order of each pixel": lambda: scene_with(projection="exact", order="pixel"),
     "unscented, colours of each pixel": lambda: scene_with(
-        {"projection": "unscented", "sh_direction": "pixel", "low_pass": 0.0}
+        projection="unscented", sh_direction="pixel", low_pass=0.0
     ),
     "features in groups": lambda: scene_with(
-        {"aovs": "z:depth, n:normal, f:feature_f", "feature_f": feature_tensor(4)}
+        aovs="z:depth, n:normal, f:feature_f", feature_f=feature_tensor(4)
     ),
-    "texture": lambda: scene_with({"background": rendered(texels())}),
-    "environment, thin lens": lambda: scene_with(sensor=thin_lens(), sky=EMITTERS["envmap"]()),
+    "texture": lambda: scene_with(background=rendered(texels())),
+    "environment, thin lens": lambda: scene_with(thin_lens(), {"sky": EMITTERS["envmap"]()}),
     "surface, environment": lambda: load_wall(
         SMALL_SCENE, sky=True, wall=Wall(half=0.5), aovs="z:depth"
     ),
-    "batch": lambda: scene_with({"aovs": "z:depth"}, batch_of_two()),
-    "motion": lambda: scene_with(sensor=moving()),
+    "batch": lambda: scene_with(batch_of_two(), aovs="z:depth"),
+    "motion": lambda: scene_with(moving()),
 }
 
 
@@ -363,7 +360,7 @@ def test_passes_of_several_samples_equal_single_sample_passes(name, monkeypatch)
 
 def test_a_pass_of_a_large_film_has_one_sample():
     film = {"width": 512, "height": PIXELS_PER_PASS // 512 + 1}
-    large = scene_with(sensor=SMALL_SCENE.view.sensor(**film)).sensors()[0]
+    large = scene_with(SMALL_SCENE.view.sensor(**film)).sensors()[0]
     assert [p.samples for p in DrawnSamples(large, 0, 3, {}).positions] == [1, 1, 1]
     small = scene_with().sensors()[0]
     at_once = PIXELS_PER_PASS // (SMALL_SCENE.view.width * SMALL_SCENE.view.height)

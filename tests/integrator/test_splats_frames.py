@@ -106,14 +106,6 @@ def test_a_parameter_written_in_place_is_rendered_again():
     assert np.abs(after - before).max() > 0.01 and np.array_equal(after, expected)
 
 
-def test_a_changed_degree_is_rendered_again():
-    scene = Scene()
-    loaded = scene.load()
-    mi.render(loaded)
-    loaded.integrator().sh_degree = 0
-    assert np.array_equal(image_of(loaded), fresh_image(replace(scene, sh_degree=0)))
-
-
 def test_a_changed_background_needs_no_new_frame(renderings):
     scene = Scene(srgb_primitives=True)
     loaded = scene.load()

@@ -107,10 +107,6 @@ PROGRAMS = {
         "dr.backward(attached('sensor.x_fov', {'type': 'splatpath'}, ball=ball)[2])",
         "splatpath: nothing that a path meets changes with the parameters",
     ),
-    "dr.freeze": (
-        "scene = load()\nfrozen = dr.freeze(lambda x: x * mi.render(scene))\nfrozen(mi.Float(1))",
-        "splats: rendering cannot be recorded by dr.freeze",
-    ),
 }
 
 

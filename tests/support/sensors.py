@@ -1,6 +1,5 @@
 """Mitsuba's sensors and the cameras that drgs makes of them."""
 
-import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.camera import Camera
@@ -19,12 +18,3 @@ def numbers(camera) -> dict[str, np.ndarray]:
     """Return the numbers of a Dr.Jit camera in float64."""
     names = ("rotation", "center", "focal", "principal", "near")
     return {n: np.array(getattr(camera, n)).astype(np.float64)[..., 0] for n in names}
-
-
-def points_on_rays(sensor) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) on the sensor's rays, and the film positions (N, 2) in px of the rays."""
-    rng = np.random.default_rng(3)
-    sample = rng.uniform(size=(2, 200)).astype(np.float32)
-    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(sample), mi.Point2f(0.5))
-    points = np.array(ray(mi.Float(rng.uniform(1, 8, 200)))).T.astype(np.float64)
-    return points, sample.T.astype(np.float64) * np.array(sensor.film().crop_size())
