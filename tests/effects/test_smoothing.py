@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from plyfile import PlyData
+from support.cases import rates_of, smoothed_reference
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -20,7 +21,6 @@ from support.helpers import (
     rows,
     single,
 )
-from support.smoothing import rates_of, smoothed_reference
 from support.views import Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)

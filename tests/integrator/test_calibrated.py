@@ -18,6 +18,7 @@ from support.calibrated_sensors import (
     FISHEYE,
     OPENCV,
     PINHOLE,
+    PIXELS,
     STATIC_SENSORS,
     THIN_PRISM,
     Calibrated,
@@ -28,7 +29,6 @@ from support.calibrated_sensors import (
     transform,
 )
 from support.lens_scenes import LENSES, points_at
-from support.sensors import PIXELS
 from support.views import VIEWS, gradients_of, image_of, pose, splats_before
 
 from drgs.gaussians.parameters import PARAMETER_NAMES

@@ -18,13 +18,14 @@ from support.calibrated_sensors import (
     SCALED,
     SHUTTER_SAMPLES,
     WINDOW,
+    camera_of,
+    numbers,
     own_camera,
     own_sensor,
 )
 from support.helpers import clear
 from support.kernels import kernel_hashes
 from support.openexr import read_exr
-from support.sensors import camera_of, numbers
 from support.splats_checks import GRADIENTS, IMAGE
 from support.splats_checks import XYZ as TO_XYZ
 from support.views import VIEWS, Scene, View, gradient, image_of, pose, tensors

@@ -1,4 +1,6 @@
-"""Features and weights of whole images."""
+"""Features, gradients and weights of whole images."""
+
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
@@ -7,10 +9,15 @@ from support.helpers import (
     FLOAT32,
     FLOAT64,
     Case,
+    Cotangents,
     assert_arrays_agree,
     both_precisions,
     clear,
+    device_camera,
+    device_gaussians,
     frame_adjoint,
+    plane_cotangents,
+    reference_gradients,
     render,
 )
 
@@ -19,7 +26,6 @@ from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
-from drgs.splatting.projection import plain_opacity
 
 # Relative to the largest value of each array.
 #
@@ -37,18 +43,23 @@ CASE = Case("degree 3", 37, 29, 3)
 
 @both_precisions
 @pytest.mark.parametrize(
-    "features",
+    ("features", "order"),
     [
-        (rendering.color_features,),
-        (rendering.depth_feature,),
-        (rendering.depth_feature, rendering.color_features, rendering.depth_feature),
+        ((rendering.color_features,), "center"),
+        ((rendering.depth_feature,), "center"),
+        (
+            (rendering.depth_feature, rendering.color_features, rendering.depth_feature),
+            "center",
+        ),
+        *(((), order) for order in ("center", "pixel")),  # what an alpha mask needs
     ],
-    ids=["color", "depth", "depth color depth"],
+    ids=["color", "depth", "depth color depth", "nothing", "nothing, pixel order"],
 )
-def test_features_are_composited_in_the_given_order(precision, features):
+def test_features_are_composited_in_the_given_order(precision, features, order):
     """Planes and gradients are those of colour and depth, whose law the matrix checks."""
-    gaussians, frame = render(CASE, precision, rendering.Pipeline(3, plain_opacity, features))
-    _, usual = render(CASE, precision)
+    usual = pipeline_of(Approximations(order=order), 3, CASE.pipeline.features)
+    gaussians, frame = render(CASE, precision, replace(usual, features=features))
+    _, usual = render(CASE, precision, usual)
     channels = [
         channel
         for feature in features
@@ -73,8 +84,28 @@ def test_features_are_composited_in_the_given_order(precision, features):
     assert_arrays_agree(
         {name: np.array(getattr(actual, name)) for name in PARAMETER_NAMES},
         {name: np.array(getattr(wanted, name)) for name in PARAMETER_NAMES},
+        GRADIENTS[precision] if features else 0,
+    )
+
+
+@both_precisions
+def test_attached_parameters_are_detached(precision):
+    """``mi.render`` does the same: gradients are suspended while attached parameters are given."""
+    case = clear(CASE)
+    gaussians = device_gaussians(case.gaussians, precision)
+    dr.enable_grad(gaussians)
+    with dr.suspend_grad():
+        camera = device_camera(case.camera, precision)
+        frame = rendering.render(gaussians, camera, case.pipeline)
+        cotangents = plane_cotangents(case, Cotangents.random(case), precision)
+        gradients = frame_adjoint(gaussians, frame, *cotangents)
+    expected = reference_gradients(case, Cotangents.random(case))
+    assert_arrays_agree(
+        {name: np.array(getattr(gradients.parameters, name)) for name in PARAMETER_NAMES},
+        {name: expected[name] for name in PARAMETER_NAMES},
         GRADIENTS[precision],
     )
+    assert not any(np.array(dr.grad(getattr(gaussians, name))).any() for name in PARAMETER_NAMES)
 
 
 @pytest.mark.parametrize("sh_direction", ["mean", "pixel"])
