@@ -333,7 +333,7 @@ REFUSED = [
         "colors must be of at most 64 channels, got 2000",
     ),
     ({"eps2d": -1.0}, "eps2d must be finite and not negative, got -1.0"),
-    ({"projection": "affine"}, "projection must be one of ewa, unscented, exact"),
+    ({"projection": "affine"}, "projection must be one of ewa, exact, unscented"),
     ({"packed": False}, "packed is a parameter of gsplat's .*; leave it out"),
     ({"with_ut": True}, 'with_ut is .*; give projection="unscented"'),
     ({"projektion": "ewa"}, "no parameter projektion; did you mean projection"),

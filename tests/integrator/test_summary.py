@@ -17,10 +17,10 @@ from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.viewpoints import CameraMotion
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
+from drgs.effects.base import integrator_settings, training_effects
 from drgs.fit.summary import summary_of_fit
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import format_effects, summary_of_sensors, summary_of_views
-from drgs.training.effects.base import integrator_settings, training_effects
 
 MODULES = """
     accuracy.exact accuracy.pixel_lists accuracy.pixel_order accuracy.ray_colors accuracy.unscented
@@ -28,11 +28,8 @@ MODULES = """
     cameras.thin_prism_fisheye effects.defocus effects.occlusion effects.smoothing
     gaussians.rotation gaussians.similarity integrator.parts integrator.light.splat_transport
     integrator.light.shadows integrator.light.surfaces light light.grid light.probe light.walk
-    training.effects.background training.effects.cameras training.effects.colors
-    training.effects.depth training.effects.masks training.effects.photometry
-    training.effects.smoothing training.effects.view_parameters
 """
-"""Modules used only by effects."""
+"""Modules used only by effects of images; a fit asks every effect whether it takes part."""
 
 
 def config_of(**changes):
@@ -48,8 +45,8 @@ def test_the_plan_of_a_plain_fit():
         "simulated:\n"
         "  view dependence: spherical harmonics up to degree 3 (model.sh_degree: 3)\n"
         "  background: white (data.background)\n"
-        "  not simulated: lens distortion, motion, antialiasing, exposure and white balance, "
-        "masks, depth, camera refinement"
+        "  not simulated: lens distortion, motion, antialiasing, depth, exposure and white "
+        "balance, masks, camera refinement"
     )
     default = FitConfig(data={"path": ".", "background": "white"})
     by_default = format_effects(summary_of_fit(default, fits.plain_dataset()))
@@ -86,10 +83,10 @@ def test_plan_of_a_fit_lists_the_setting_of_each_effect():
         "  motion: rolling shutter (1 of the dataset's cameras)\n"
         "  antialiasing: opacities compensated for the low-pass filter, 3D smoothing filter "
         "(model.antialiased, model.smoothing)\n"
+        "  depth: supervision (the dataset's depth, in 6 views)\n"
         "  exposure and white balance: a colour transform for each training photograph "
         "(colors.lr)\n"
         "  masks: pixels left out (the dataset's masks, in 2 views)\n"
-        "  depth: supervision (the dataset's depth, in 6 views)\n"
         "  camera refinement: poses, focal lengths (cameras.optimise)\n"
         "  not simulated: view dependence"
     )
@@ -122,8 +119,8 @@ def test_plan_of_a_fit_lists_ignored_data():
     """Not what is ignored and not there."""
     ignored = replace(fits.plain_dataset(), ignored=("distortion", "motion", "masks", "depth"))
     assert format_effects(summary_of_fit(config_of(), ignored)).splitlines()[-1] == (
-        "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, exposure and "
-        "white balance, masks (ignored), depth (ignored), camera refinement"
+        "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, "
+        "depth (ignored), exposure and white balance, masks (ignored), camera refinement"
     )
     plain = config_of(
         loss__depth_weight=0.0, data__ignore_distortion=True, data__ignore_motion=True
@@ -232,22 +229,8 @@ import json, sys
 sys.path.insert(0, {tests!r})
 import drgs, mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_rgb")
-from dataclasses import replace
-from drgs.training.effects.base import training_effects
-from drgs.fit.summary import summary_of_fit
 from support import small_capture as capture
 from support.trainers import make_trainer
-from support.viewer_rendering import VIEWER_RENDERING
-from drgs.config.changes import with_changes
-from drgs.config.schema import FitConfig
-
-def plan(mask=None, **changes):
-    plain = capture.make_dataset(2, 1)
-    dataset = replace(plain, train=tuple(replace(view, mask=mask) for view in plain.train))
-    changes = {{key.replace("__", "."): value for key, value in changes.items()}}
-    config = with_changes(FitConfig(data={{"path": "."}}), changes)
-    summary_of_fit(config, dataset)
-    training_effects(config, dataset)
 
 def show(objects=(), kind="perspective", sensor=(), **settings):
     film = {{"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {{"type": "box"}}}}
@@ -256,7 +239,6 @@ def show(objects=(), kind="perspective", sensor=(), **settings):
     scene = {{"type": "scene", "integrator": integrator, "sensor": sensor, **dict(objects)}}
     mi.render(mi.load_dict(scene), spp=1)
 
-ones = np.ones((capture.HEIGHT, capture.WIDTH), np.float32)
 aperture = {{"aperture_radius": 0.1, "focus_distance": 2.0}}
 sky = {{"sky": {{"type": "constant"}}}}
 lit = {{**sky, "ball": {{"type": "sphere"}}}}
@@ -271,13 +253,7 @@ print(json.dumps(found))
 """
 
 STEPS = {
-    "make_trainer().step()": "",
-    "plan()": "",
-    "plan(model__smoothing=True)": "effects.smoothing training.effects.smoothing",
-    "plan(mask=ones)": "training.effects.masks",
-    "plan(colors__lr=0.1)": "training.effects.colors training.effects.view_parameters",
-    "plan(colors__vignetting_lr=0.1)": "training.effects.photometry",
-    "plan(cameras__optimise=True)": "cameras.motion training.effects.cameras",
+    "make_trainer().step()": "cameras.motion effects.smoothing",
     "show(kind='calibrated')": "",
     "show(light='none')": "",
     "show(light='rays')": "",  # without surfaces
