@@ -364,9 +364,6 @@ ELSEWHERE = {
             "self(image, target)",
         )
     },
-    "footprint._productsreturn [a * b for a, b in zip(values, flat_columns(grid), strict=True)]": (
-        "test_sampling: points anywhere in pixels"
-    ),
     "footprint.Cutoffs.log2_floorat_extent > least": "the package's own cut-offs are used",
     **dict.fromkeys(
         (

@@ -62,7 +62,6 @@ from drgs.splatting.footprint import (
     MicroTileFootprint,
     Offsets,
     SamplePositions,
-    flat_columns,
 )
 from drgs.splatting.projection import (
     FilmShape,
@@ -154,12 +153,7 @@ class RayFootprint(MicroTileFootprint):
 
     along: list[Float]  # A = a / D: depth of the peak, divided by z_mean / |a_c|
     exponent: list[Float]  # B = |e|^2 / D, base 2
-    from_anchor: tuple[list, list]  # grids of x - c, px
-
-    @property
-    def coordinates(self) -> list[tuple[Float, Float]]:
-        """e = (u, v)."""
-        return list(zip(flat_columns(self.u), flat_columns(self.v), strict=True))
+    from_anchor: tuple[list[Float], list[Float]]  # x - c, px
 
 
 @dataclass(frozen=True)
@@ -261,9 +255,8 @@ class RayFalloff(GaussianFalloff):
         log2_opacity = dr.select(active, self.log2_opacity(geometry), -dr.inf)
         assert self.camera is not None, "bound by for_camera"
         from_anchor = offsets_from(*closest_on_film(self.camera, *geometry[:2]))
-        pixels = zip(*map(flat_columns, (affine.u, affine.v, *from_anchor)), strict=True)
         along, exponent, log2_alpha = [], [], []
-        for u, v, x, y in pixels:
+        for u, v, x, y in zip(affine.u, affine.v, *from_anchor, strict=True):
             squared, a, denominator = ray_denominator(geometry, u, v, x, y)
             # Elsewhere alpha is 0, and its derivatives' factors have to be finite.
             shows = (a > 0) & (squared < MAX_EXPONENT * denominator)
@@ -271,16 +264,8 @@ class RayFalloff(GaussianFalloff):
             along.append(a * inverse)
             exponent.append(squared * inverse)
             log2_alpha.append(dr.select(shows, log2_opacity - exponent[-1], -dr.inf))
-        return RayFootprint(
-            dx=affine.dx,
-            dy=affine.dy,
-            u=affine.u,
-            v=affine.v,
-            log2_alpha=log2_alpha,
-            along=along,
-            exponent=exponent,
-            from_anchor=from_anchor,
-        )
+        grids = affine.dx, affine.dy, affine.u, affine.v
+        return RayFootprint(*grids, log2_alpha, along, exponent, from_anchor)
 
     @override
     def moments(
@@ -296,9 +281,8 @@ class RayFalloff(GaussianFalloff):
         dx, dy = footprint.dx, footprint.dy
         anchor_x, anchor_y = footprint.from_anchor
         x, y, z, bb = [], [], [], []
-        for w, a, b, (u, v) in zip(
-            weights, footprint.along, footprint.exponent, footprint.coordinates, strict=True
-        ):
+        pixels = weights, footprint.along, footprint.exponent, footprint.u, footprint.v
+        for w, a, b, u, v in zip(*pixels, strict=True):
             w_a, w_b = w * a, w * b
             x.append(w_a * a * u)
             y.append(w_a * a * v)
@@ -351,15 +335,11 @@ class RayFalloff(GaussianFalloff):
         d_x, d_y, d_p, d_r, d_s, d_log_opacity, d_gx, d_gy, d_h = d_geometry
         d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
         d_h = d_h / WHITENING_SCALE**2
-        pixels = zip(
-            *map(flat_columns, (footprint.dx, footprint.dy, footprint.u, footprint.v)),
-            *map(flat_columns, footprint.from_anchor),
-            footprint.along,
-            footprint.exponent,
-            strict=True,
-        )
+        pixels = footprint.dx, footprint.dy, footprint.u, footprint.v, *footprint.from_anchor
         result = []
-        for dx, dy, u, v, x, y, a, b in pixels:
+        for dx, dy, u, v, x, y, a, b in zip(
+            *pixels, footprint.along, footprint.exponent, strict=True
+        ):
             d_u = dr.fma(d_p, dx, dr.fma(d_r, dy, -dr.fma(p, d_x, r * d_y)))
             d_v = dr.fma(d_s, dy, -s * d_y)
             d_a = dr.fma(d_gx, x, d_gy * y)

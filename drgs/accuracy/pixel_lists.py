@@ -19,7 +19,7 @@ from drgs.cameras.camera import Camera
 from drgs.core.arrays import reinterpret, types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.types import Array3f, Float, UInt32
-from drgs.splatting.footprint import GaussianFalloff, MicroTileFootprint, flat_columns
+from drgs.splatting.footprint import GaussianFalloff, MicroTileFootprint
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, Lanes, TileGrid, load_pixels
 from drgs.splatting.projection import (
     FilmProjection,
@@ -74,7 +74,7 @@ class AffineDepths:
         ]
 
     def _pixel_depths(self, footprint: MicroTileFootprint, keys: list[Float]) -> list[Float]:
-        coordinates = zip(flat_columns(footprint.u), flat_columns(footprint.v), strict=True)
+        coordinates = zip(footprint.u, footprint.v, strict=True)
         return [
             a / denominator for a, denominator in (self._depth_ratio(keys, *e) for e in coordinates)
         ]

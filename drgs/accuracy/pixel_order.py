@@ -35,7 +35,7 @@ from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import Rows, scatter_rows, types_of
 from drgs.core.types import Bool, Float, UInt32
-from drgs.splatting.footprint import Alpha, ImageModel, MicroTileFootprint, flat_columns
+from drgs.splatting.footprint import Alpha, ImageModel, MicroTileFootprint
 from drgs.splatting.grid import (
     PIXELS,
     Lanes,
@@ -116,11 +116,6 @@ class PixelOrder(CenterOrder):
     @override
     def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
         return _tangent(_WalkInputs.from_tiles(tiles, self), tiles, tangents)
-
-
-# ----------------------------------------------------------------------------------------------
-# The walk
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -274,11 +269,6 @@ def _insert(places: list[list[Float]], item: list[Float]) -> tuple[list[list[Flo
     return places, item
 
 
-# ----------------------------------------------------------------------------------------------
-# Forward
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _OrderedTiles(CompositedTiles):
     """Composited tiles with the lists, which the adjoint and the tangent use again."""
@@ -309,7 +299,7 @@ def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedT
         nothing=[dr.zeros(t.Float, size)] * count,
     )
     dr.eval(T, C)
-    columns = [dr.abs(v) for v in T] + flat_columns(C)
+    columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
     last = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
     return _OrderedTiles(
         bins=bins,
@@ -320,11 +310,6 @@ def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedT
         count=count,
         lists=lists,
     )
-
-
-# ----------------------------------------------------------------------------------------------
-# Adjoint
-# ----------------------------------------------------------------------------------------------
 
 
 def _adjoint(
@@ -471,11 +456,6 @@ def _add_product(high: Float, low: Float, a: Float, b: Float) -> tuple[Float, Fl
     return total, low + (lost + rest)
 
 
-# ----------------------------------------------------------------------------------------------
-# Tangent
-# ----------------------------------------------------------------------------------------------
-
-
 def _tangent(inputs: _WalkInputs, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
     bins, model, size = inputs.bins, inputs.model, inputs.size
     d_records, count = pack_tangents(bins, tangents), tiles.count
@@ -511,6 +491,6 @@ def _tangent(inputs: _WalkInputs, tiles: CompositedTiles, tangents: SplatGradien
         state=(inputs.transmittance(), inputs.zeros(1)[0], inputs.zeros(count)),
         nothing=[dr.zeros(bins.rows.Float, size)] * (1 + 2 * count),
     )
-    columns = dT + flat_columns(dC)
+    columns = dT + [v for plane in dC for v in plane]
     dr.eval(columns)
     return tiles.unpack(scatter_rows(columns, inputs.lanes.micro_tile, size))

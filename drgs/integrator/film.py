@@ -274,13 +274,9 @@ class LanePoints(SamplePositions):
         ]
 
     @override
-    def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
+    def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list[Float], list[Float]]:
         Float = types_of(type(x)).Float
         first_x, first_y = Float(lanes.x) - x, Float(lanes.y) - y
         dx = [first_x + (pixel % MICRO) + in_x for pixel, in_x in enumerate(self.x)]
         dy = [first_y + (pixel // MICRO) + in_y for pixel, in_y in enumerate(self.y)]
-        return _grid(dx), _grid(dy)
-
-
-def _grid(values: list[Float]) -> list[list[Float]]:
-    return [values[MICRO * j : MICRO * j + MICRO] for j in range(MICRO)]
+        return dx, dy

@@ -166,11 +166,6 @@ class Records:
         return self.rows.load(entry, active)[self.num_geometry + self.num_features :]
 
 
-# ----------------------------------------------------------------------------------------------
-# Forward
-# ----------------------------------------------------------------------------------------------
-
-
 def composite(bins: TileBins, records: Records) -> CompositedTiles:
     """Composite the features of all splats.
 
@@ -255,10 +250,6 @@ def largest(values: list[UInt32]) -> UInt32:
         result = dr.select(v > result, v, result)
     return result
 
-
-# ----------------------------------------------------------------------------------------------
-# Adjoint
-# ----------------------------------------------------------------------------------------------
 
 SPARE_ROWS = 64  # behind the slots, for sums of lanes without a splat
 
@@ -444,11 +435,6 @@ def splat_gradients(
     dr.eval(rows)
     numbers = rows.load(rank)
     return SplatGradients(geometry=numbers[:count], features=numbers[count:])
-
-
-# ----------------------------------------------------------------------------------------------
-# Tangent (forward mode)
-# ----------------------------------------------------------------------------------------------
 
 
 def composite_tangent(tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:

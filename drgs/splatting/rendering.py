@@ -350,7 +350,7 @@ def _attach(
     """
     numbers, falloff = [], pipeline.model.for_camera(camera).falloff
     if with_camera:
-        pipeline.model.check_differentiable_in_camera()
+        pipeline.model.features.check_differentiable_in_camera()
         camera = camera.by_lane(dr.width(rows.logit_opacities))
         numbers = camera.numbers()
     inputs = pipeline.select_differentiable(rows), numbers
