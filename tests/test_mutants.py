@@ -381,12 +381,12 @@ FUNCTIONS = """
     rasterize.composite_tangent rasterize.pack_tangents footprint.GaussianFalloff.moments
     footprint.GaussianFalloff.derivatives footprint.GaussianFalloff.tangent
     footprint.GaussianFalloff.pack_tangents footprint.SplatFeatures.add_derivatives
-    footprint.PixelCenters.sum_dx rendering._splat_tangents rendering.gradients_of
+    footprint.PixelCenters.sum_dx rendering.frames_tangent rendering.gradients_of
     rendering._back_to_rows rendering.gradients_by_row rendering._as_tensors
     losses._ssim_and_partials losses._assemble_gradient losses._PhotometricOp.backward
     losses._PhotometricOp.forward losses.l1_loss exact.RayFalloff.moments
     exact.RayFalloff.derivatives exact.RayFalloff.tangent exact.RayFalloff.pack_tangents
-    pixel_order._adjoint pixel_order._add_product pixel_order._totals pixel_order._pairs
+    pixel_order._add_product pixel_order._totals pixel_order._pairs
     pixel_order._sum_pixels pixel_order._tangent ray_colors.RayColors.add_derivatives
     ray_colors.RayColors.tangents
 """

@@ -91,18 +91,13 @@ def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:
     return (ewa,) if all(camera.lens.parallel for camera in cameras) else (ewa, unscented)
 
 
-def own_samples(cameras: Sequence[Camera]) -> int:
-    """Return the largest number of times of an open shutter; 0: no camera has one."""
-    shutters = [one.shutter for one in cameras]
-    return max((one.samples for one in shutters if isinstance(one, MotionBlur)), default=0)
-
-
 def shutter_samples(cameras: Sequence[Camera]) -> tuple[Level, ...]:
     """Return numbers of times of an open shutter, if a camera has one; costs relative to its own.
 
     Twice the last one is taken for exact.
     """
-    own = own_samples(cameras)
+    shutters = [one.shutter for one in cameras]
+    own = max((one.samples for one in shutters if isinstance(one, MotionBlur)), default=0)
     counts = sorted({max(1, own // 4), max(1, own // 2), own, 2 * own}) if own else []
     return tuple(Level({SAMPLES: n}, n / own) for n in counts if n <= MAX_SHUTTER_SAMPLES)
 

@@ -57,12 +57,7 @@ from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.errors import UnsupportedError
 from drgs.core.types import Array2f, Array3f, Bool, Float
-from drgs.splatting.footprint import (
-    GaussianFalloff,
-    MicroTileFootprint,
-    Offsets,
-    SamplePositions,
-)
+from drgs.splatting.footprint import GaussianFalloff, MicroTileFootprint, Offsets, SamplePositions
 from drgs.splatting.projection import (
     FilmShape,
     GaussianRows,

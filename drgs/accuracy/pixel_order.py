@@ -111,7 +111,10 @@ class PixelOrder(CenterOrder):
         before: SplatGradients | None = None,
     ) -> SplatGradients:
         inputs = _WalkInputs.from_tiles(tiles, self, samples)
-        return _adjoint(inputs, tiles, d_planes, before)
+        d_transmittance, *d_features = d_planes
+        g = [load_pixels(plane, inputs.lanes, inputs.bins.grid) for plane in d_features]
+        pairs = _pairs(inputs, _totals(inputs, tiles, g, d_transmittance), g)
+        return _sum_items(inputs, _sum_pixels(inputs, pairs, g), before)
 
     @override
     def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
@@ -310,19 +313,6 @@ def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedT
         count=count,
         lists=lists,
     )
-
-
-def _adjoint(
-    inputs: _WalkInputs,
-    tiles: CompositedTiles,
-    d_planes: Sequence[Float],
-    before: SplatGradients | None,
-) -> SplatGradients:
-    d_transmittance, *d_features = d_planes
-    g = [load_pixels(plane, inputs.lanes, inputs.bins.grid) for plane in d_features]
-    totals = _totals(inputs, tiles, g, d_transmittance)
-    pairs = _pairs(inputs, totals, g)
-    return _sum_items(inputs, _sum_pixels(inputs, pairs, g), before)
 
 
 def _feature_gradient(

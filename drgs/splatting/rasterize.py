@@ -226,7 +226,7 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
         records=records,
         values=scatter_rows(columns, lanes.micro_tile, size),
         ends=scatter_rows(ends, lanes.micro_tile, size),
-        stop=scatter_rows([largest(ends)], lanes.micro_tile, size),
+        stop=scatter_rows([reduce(_larger, ends)], lanes.micro_tile, size),
         count=count,
     )
     dr.eval(stored.values, stored.ends, stored.stop)
@@ -243,12 +243,8 @@ def any_unfinished(transmittances: list[Float]) -> Bool:
     return reduce(and_, map(sign_bits, transmittances)) >= 0
 
 
-def largest(values: list[UInt32]) -> UInt32:
-    """Return the largest of several numbers, lane by lane."""
-    result = values[0]
-    for v in values[1:]:
-        result = dr.select(v > result, v, result)
-    return result
+def _larger(a: UInt32, b: UInt32) -> UInt32:
+    return dr.select(b > a, b, a)
 
 
 SPARE_ROWS = 64  # behind the slots, for sums of lanes without a splat
@@ -350,11 +346,7 @@ def _partials(tiles: CompositedTiles, slots: Slots, d_planes: Sequence[Float]) -
         return cursor, slot, pixels
 
     loop = dr.while_loop(
-        state=(
-            entries.begin(),
-            slots.end(entries),
-            last,
-        ),
+        state=(entries.begin(), slots.end(entries), last),
         cond=lambda cursor, slot, pixels: entries.pending(cursor),
         body=body,
     )

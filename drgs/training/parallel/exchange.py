@@ -434,8 +434,8 @@ class ViewExchange:
         with dr.suspend_grad():
             gaussians, found, of_cameras = dr.detach(self.integrator.gaussians), [], []
             for local, gradients in zip(each.local, each.gradients, strict=True):
-                seen = local.camera, local.pipeline, gradients
-                of_view, of_rows = gradients_by_row(gaussians, *seen, with_camera=True)
+                seen = CameraGradients(local.camera, local.pipeline, gradients)
+                of_view, of_rows = gradients_by_row(gaussians, seen, with_camera=True)
                 found.append(of_view)
                 rows = np.stack([np.array(column) for column in of_rows], axis=1)
                 rows = self.comm.gather_rows(rows, each.renderer)
