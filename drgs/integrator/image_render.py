@@ -24,9 +24,17 @@ from drgs.core.memory import MAX_LANES, UNCHECKED_BYTES, available_memory, too_l
 from drgs.core.types import Float
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.film import CenterSamples, Channels, decode, sample_offsets
+from drgs.integrator.film import (
+    CenterSamples,
+    Channels,
+    DrawnSamples,
+    background_radiance,
+    decode,
+    sample_offsets,
+)
 from drgs.integrator.sensors import (
     SensorState,
+    SideBySide,
     accumulate_in_sensor,
     attached_cameras,
     camera_from_sensor,
@@ -43,7 +51,6 @@ from drgs.splatting.footprint import SamplePositions
 if TYPE_CHECKING:  # imported where a scene requires them
     from drgs.integrator.light.surfaces import NestedSurfaces
     from drgs.integrator.light.visible_surfaces import SurfaceLayers
-    from drgs.integrator.sensors import SideBySide
 
 
 Passes = list[Channels]  # channels by pass: one sample per pixel or, on a small film, several
@@ -80,8 +87,6 @@ class ImageRender:
         if spp == 1 and film.rfilter().is_box_filter():
             samples = CenterSamples(film, maps, names)
         else:
-            from drgs.integrator.film import DrawnSamples
-
             samples = DrawnSamples(sensor, seed, spp, maps, names)
         whole = SensorRender(
             splats=splats,
@@ -95,8 +100,6 @@ class ImageRender:
         )
         if not is_batch(sensor):
             return ImageRender([whole], samples, nested)._with_surfaces()
-        from drgs.integrator.sensors import SideBySide
-
         batch = SideBySide.from_batch(sensor)
         views = [
             replace(
@@ -364,8 +367,6 @@ class SensorRender:
         cameras = [of_time[0].camera for of_time in self._frames]
         if state.is_attached:
             cameras = self._attached_cameras(state)
-        from drgs.integrator.background import background_radiance
-
         colors = radiance = background_radiance(self.sensor.film(), behind, cameras, self._offsets)
         if environment is None or not splats.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]

@@ -133,18 +133,8 @@ OBJECT_PROPERTIES = ("filename", "to_world", "smoothing", *PARAMETER_NAMES)
 """Properties of a ``splats`` that is nested in another, besides :data:`FEATURE`."""
 
 KNOWN = (
-    *(
-        "filename",
-        "to_world",
-        SHAPES_TO_WORLD,
-        "background",
-        "probes",
-        "shadows",
-        "aovs",
-        "ignore",
-        "error",
-    ),
-    *("smoothing", *SETTINGS, *LIGHT_SETTINGS, *DECLARED, *PARAMETER_NAMES),
+    *("filename", "to_world", SHAPES_TO_WORLD, "background", "probes", "shadows", "aovs"),
+    *("ignore", "error", "smoothing", *SETTINGS, *LIGHT_SETTINGS, *DECLARED, *PARAMETER_NAMES),
 )
 """Properties of ``splats``, besides nested objects and names with a prefix."""
 

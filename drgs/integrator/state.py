@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeGuard, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -71,7 +71,6 @@ class RenderCache:
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
     parts: CombinedParts | None = None  # None: the own Gaussians alone, unmoved
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
-    instances: list[mi.Shape] = field(default_factory=list)  # of the last scene, checked
     sensor: mi.Sensor | None = None  # rendered last
     surfaces: Any = None  # drgs.integrator.light.surfaces.Surfaces of the last scene that has some
     too_close: frozenset[str] = frozenset()  # ids of objects with a logged warning
@@ -312,7 +311,7 @@ class SplatsState:
         cache, self.cache.shaded = self.cache, None
         for one in self.objects.values():  # an update that was refused may have left rows
             check_shapes(self.rendered_part_of(one))
-        cache.instances = check_instances(scene, cache.instances)
+        check_instances(scene)
         shapes = ellipsoids_in(scene)
         cache.has_ellipsoids = bool(shapes)
         with dr.resume_grad():
@@ -438,20 +437,18 @@ def surfaces_in(scene: mi.Scene) -> list[mi.Shape]:
     return [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
 
 
-def check_instances(scene: mi.Scene, last: Sequence[mi.Shape]) -> list[mi.Shape]:
-    """Raise UnsupportedError for instances of Gaussians; last: those already checked."""
-    instances = [shape for shape in scene.shapes() if shape.class_name() == "Instance"]
-    if not instances or list(map(id, instances)) == list(map(id, last)):
-        return instances
-    repeated, shapes = mi.traverse(scene).hierarchy, scene.shapes()
-    for node, (group, _) in repeated.items():
+def check_instances(scene: mi.Scene) -> None:
+    """Raise UnsupportedError for instances of Gaussians."""
+    shapes = scene.shapes()
+    if all(shape.class_name() != "Instance" for shape in shapes):
+        return
+    for node, (group, _) in mi.traverse(scene).hierarchy.items():
         if isinstance(node, mi.Shape) and node.is_ellipsoids() and node not in shapes:
             raise UnsupportedError(
                 f"splats: shape group '{group.id()}' holds Gaussians (shape '{node.id()}'), whose "
                 "instances are not supported: use a shape of type ellipsoids for each, with a "
                 "to_world, or a nested splats"
             )
-    return instances
 
 
 def feature_widths(objects: dict[str, SplatObject]) -> dict[str, int]:
@@ -474,3 +471,38 @@ def feature_of(kind: str) -> rendering.Feature:
     from drgs.effects.compose import NamedFeature, normal_features
 
     return normal_features if kind == "normal" else NamedFeature(kind)
+
+
+if TYPE_CHECKING:
+
+    class SplatsPlugin(mi.Integrator):
+        """Members of the plugin ``splats``, whose class exists once for each variant."""
+
+        state: SplatsState
+        gaussians: Gaussians
+        sh_degree: int
+        smoothing: Float | None
+        near: float
+        ignore: Sequence[str]
+        pipeline: rendering.Pipeline
+        last: BackwardResult  # after a backward pass
+
+        def use_projection(self, stage: rendering.ProjectionStage) -> None:
+            """Set the projection of the coming renders."""
+            ...
+
+        def forget_frames(self) -> None:
+            """Clear the cached frames."""
+            ...
+
+        def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str:
+            """Return a summary of the simulated effects."""
+            ...
+
+else:
+    SplatsPlugin = Any
+
+
+def is_splats(node: object) -> TypeGuard[SplatsPlugin]:
+    """Return whether a Mitsuba object is the integrator ``splats``."""
+    return isinstance(getattr(node, "state", None), SplatsState)

@@ -53,7 +53,7 @@ def format_effects(effects: Sequence[SimulatedEffect]) -> str:
 def summary_of_scene(splats: SplatsState, scene: mi.Scene, sensors: Sequence[mi.Sensor]) -> str:
     """Return the summary of the integrator ``splats``, whose Gaussians are up to date."""
     alone = [one for sensor in sensors for one in sensors_of(sensor)]
-    cameras = [camera_from_sensor(read_sensor(one, splats.near).detach()) for one in alone]
+    cameras = [camera_from_sensor(read_sensor(one, splats.near)) for one in alone]
     count = len(surfaces_in(scene))
     return format_effects(summary_of_sensors(splats, cameras, scene.environment(), count))
 

@@ -19,7 +19,7 @@ from drgs.datasets.images import shift_pixels, smaller_view
 from drgs.datasets.storage import is_on_disk
 from drgs.datasets.types import View
 from drgs.integrator.scene import make_sensors
-from drgs.integrator.types import SplatsPlugin
+from drgs.integrator.state import SplatsPlugin
 from drgs.training.effects.base import TrainingEffect, TrainingView
 from drgs.training.losses import TARGET_BYTES
 from drgs.training.rates import LearningRates

@@ -24,7 +24,7 @@ from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
-from drgs.integrator.types import SplatsPlugin
+from drgs.integrator.state import SplatsPlugin
 from drgs.splatting.rendering import NO_FAULT
 from drgs.training.density.strategy import (
     DensityReport,

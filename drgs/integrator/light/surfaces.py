@@ -371,13 +371,10 @@ class NestedSurfaces:
 
         Paths from behind windows have fewer bounces where ``max_depth`` can be set in Python.
         """
-        if not self.surfaces.is_transparent:
-            with _keep_sample_count(self.sensor):
-                yield self.sensor
-            return
         for count in range(self.compositor.num_surfaces):
-            behind = RaysBehind(self.rays, count)
-            sensor = sensor_behind(self.sensor, sensors_of(self.sensor), behind)
+            sensor = self.sensor
+            if self.surfaces.is_transparent:
+                sensor = sensor_behind(sensor, sensors_of(sensor), RaysBehind(self.rays, count))
             with (
                 _keep_sample_count(self.sensor),
                 _reduce_depth(self.integrator, count),
@@ -388,7 +385,7 @@ class NestedSurfaces:
     @contextmanager
     def _differentiating(self) -> Iterator[list[Parameter]]:
         """Yield the attached parameters of the surfaces; errors are raised with their names."""
-        with dr.resume_grad(), _keep_sample_count(self.sensor):
+        with dr.resume_grad():
             parameters = list(attached_parameters(self.rays.scene))
             try:
                 yield parameters

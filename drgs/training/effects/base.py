@@ -20,7 +20,7 @@ from drgs.core.errors import UserError
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.images import with_arrays
 from drgs.datasets.types import Dataset, View
-from drgs.integrator.types import SplatsPlugin
+from drgs.integrator.state import SplatsPlugin
 from drgs.training.findings import Finding, ShortFit
 from drgs.training.losses import Target, prepare_target
 

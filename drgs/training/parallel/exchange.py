@@ -40,7 +40,7 @@ from drgs.integrator.sensors import (
     camera_from_sensor,
     read_sensor,
 )
-from drgs.integrator.types import SplatsPlugin
+from drgs.integrator.state import SplatsPlugin
 from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (
     NO_FAULT,
