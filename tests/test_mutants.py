@@ -66,8 +66,8 @@ class Copies:
         self.chain = Instrumented(
             board,
             rendering,
-            derivatives=["frames_adjoint", "frames_tangent", "DirectProjection.gradients"],
-            forward=["render", "Frame.planes", "DirectProjection.project"],
+            derivatives=["frames_adjoint", "frames_tangent", "ProjectionStage.gradients"],
+            forward=["render", "Frame.planes", "ProjectionStage.project"],
         )
         self.model = Instrumented(
             board,
@@ -146,7 +146,7 @@ class Copies:
             patch.setattr(order, name, self.stage(name))
         # Frames of the forward pass, which is not the copy's, go back through this.
         patch.setattr(
-            rendering.DirectProjection, "gradients", self.chain["DirectProjection"].gradients
+            rendering.ProjectionStage, "gradients", self.chain["ProjectionStage"].gradients
         )
         patch.setattr(footprint, "GaussianFalloff", self.model["GaussianFalloff"])
         patch.setattr(special_checks, "Alpha", self.model["Alpha"])

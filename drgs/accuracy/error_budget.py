@@ -87,7 +87,7 @@ def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:
     ewa, unscented = Level({"projection": "ewa"}, 1), Level({"projection": "unscented"}, 1.03)
     if all(isinstance(camera.lens, Pinhole) for camera in cameras):
         return ewa, Level({"projection": "exact"}, 1.2, 1.05)
-    # DirectProjection along parallel rays, Gaussians are Gaussians.
+    # Along parallel rays, projected Gaussians are Gaussians.
     return (ewa,) if all(camera.lens.parallel for camera in cameras) else (ewa, unscented)
 
 

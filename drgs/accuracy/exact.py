@@ -166,11 +166,6 @@ class RayFalloff(GaussianFalloff):
     def num_geometry(self) -> int:
         return 9
 
-    @property
-    @override
-    def num_moments(self) -> int:
-        return 9
-
     @override
     def for_camera(self, camera: Camera) -> RayFalloff:
         """Bind to a camera, whose film has the anchors; UnsupportedError unless it is a pinhole."""

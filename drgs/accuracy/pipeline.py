@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
 from drgs.core.errors import UnsupportedError
-from drgs.splatting.footprint import DEFAULT, Cutoffs, GaussianFalloff, ImageModel
+from drgs.splatting.footprint import Cutoffs, ImageModel
 from drgs.splatting.projection import color_at_mean, compensated_opacity, plain_opacity
 from drgs.splatting.rendering import Feature, Pipeline, color_features
 
@@ -23,7 +23,6 @@ def pipeline_of(
     cutoffs = Cutoffs(
         approximations.alpha_max, approximations.alpha_cut, stop, approximations.extent
     )
-    model = DEFAULT if cutoffs == Cutoffs() else ImageModel(cutoffs=cutoffs)
     projection = PROJECTIONS.get(approximations.projection).value
     falloff = FALLOFFS.get(approximations.falloff).value
     if projection.falloff is not None:
@@ -33,8 +32,7 @@ def pipeline_of(
                 f"falloff '{approximations.falloff}'; use another projection, or no falloff"
             )
         falloff = projection.falloff
-    if falloff is not GaussianFalloff:
-        model = replace(model, falloff=falloff())
+    model = ImageModel(falloff=falloff(), cutoffs=cutoffs)
     shape, order = ORDERS.get(approximations.order).value.create(projection, approximations)
     color = color_at_mean
     if approximations.sh_direction == "pixel":

@@ -147,7 +147,7 @@ class SplatsState:
     given_error: float | None  # budget of the approximations' error; None: as they are given
     budget_report: Any = None  # drgs.accuracy.error_budget.BudgetReport, once it was met
     cache: RenderCache = field(default_factory=RenderCache)
-    projection: rendering.ProjectionStage = field(default_factory=rendering.DirectProjection)
+    projection: rendering.ProjectionStage = rendering.DIRECT_PROJECTION
 
     @property
     def objects(self) -> dict[str, SplatObject]:
@@ -346,11 +346,12 @@ class SplatsState:
         return parts
 
     def _placements(self) -> list[Placement]:
-        from drgs.integrator.parts import Placement
+        from drgs.integrator.parts import TO_WORLD, Placement
 
         return [
-            Placement.from_matrix(
-                self.rendered_part_of(one), one.to_world.matrix, f"splats: {k}to_world"
+            Placement(
+                {**self.rendered_part_of(one).arrays, TO_WORLD: one.to_world.matrix},
+                f"splats: {k}to_world",
             )
             for k, one in self.objects.items()
         ]
@@ -396,6 +397,7 @@ def check_shapes(gaussians: Gaussians) -> None:
         "logit_opacities": [()],
         "sh0": [(1, 3)],
         "shN": [((degree + 1) ** 2 - 1, 3) for degree in range(4)],
+        **({} if gaussians.smoothing is None else {"smoothing": [()]}),
     }
     for name, allowed in rows.items():
         got = tuple(getattr(gaussians, name).shape)
@@ -411,11 +413,6 @@ def check_shapes(gaussians: Gaussians) -> None:
                 f"splats: {name} must have the shape (N, C), with N = {num} the rows of means and "
                 f"C at least 1, got {tuple(tensor.shape)}"
             )
-    if gaussians.smoothing is not None and dr.width(gaussians.smoothing) != num:
-        raise PluginError(
-            f"splats: smoothing must have the shape (N), with N = {num} the rows of means, got "
-            f"({dr.width(gaussians.smoothing)},)"
-        )
 
 
 def check_degree(degree: int, gaussians: Gaussians) -> None:

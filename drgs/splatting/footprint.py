@@ -224,7 +224,7 @@ class GaussianFalloff:
     @property
     def num_moments(self) -> int:
         """Sums over pixels, by splat."""
-        return 6
+        return self.num_geometry
 
     def for_camera(self, camera: Camera) -> GaussianFalloff:
         """Return this falloff for one camera; here, it is independent of the camera."""

@@ -17,10 +17,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import Protocol
 
 import drjit as dr
-from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import first_numbers, repeat_array, store_columns, types_of
@@ -61,35 +59,32 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
     return [splats.depths]
 
 
-class ProjectionStage(Protocol):
-    """The source of a frame's splats, and the destination of their derivatives."""
+class ProjectionStage:
+    """The source of a frame's splats, and the destination of their derivatives.
+
+    Here, the rendered Gaussians are projected, and the projection is differentiated.
+    """
 
     def project(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
-        """Return the splats of the Gaussians for ``camera``."""
-        ...
+        """Return the splats of the Gaussians for ``camera``, the stored inputs of compositing."""
+        rows = load_rows(gaussians, pipeline.sh_degree)
+        splats = pipeline.project(rows, camera)
+        columns = pipeline.feature_columns(splats, rows, camera)
+        grid, model = TileGrid(camera.width, camera.height), pipeline.model.for_camera(camera)
+        order = pipeline.order.for_camera(camera)
+        keys, splats = order.keys(splats), replace(splats, depths=order.sort_depths(splats))
+        return splat_table(splats, grid, columns, model, keys)
 
     def gradients(
         self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, with_camera: bool
     ) -> GaussianGradients:
         """Return derivatives of the loss, from those with respect to the splats of a frame."""
-        ...
-
-
-@dataclass(frozen=True)
-class DirectProjection(ProjectionStage):
-    """Project the rendered Gaussians, and differentiate the projection."""
-
-    @override
-    def project(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
-        return project_splats(gaussians, camera, pipeline)
-
-    @override
-    def gradients(
-        self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, with_camera: bool
-    ) -> GaussianGradients:
         given = CameraGradients(frame.camera, frame.pipeline, of_splats)
         total = gradients_of(gaussians, given, with_camera)
         return replace(total, visible=on_film(frame.tiles.bins))
+
+
+DIRECT_PROJECTION = ProjectionStage()
 
 
 def load_unchanged(rows: GaussianRows) -> GaussianRows:
@@ -110,7 +105,7 @@ class Pipeline:
     low_pass: float = LOW_PASS  # px^2
     model: ImageModel = DEFAULT
     order: CenterOrder = field(default_factory=CenterOrder)
-    source: ProjectionStage = DirectProjection()
+    source: ProjectionStage = DIRECT_PROJECTION
     of_smoothing: bool = False  # whether the smoothing filter is differentiated
 
     def select_differentiable(self, rows: GaussianRows) -> GaussianRows:
@@ -180,17 +175,6 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     bins = bin_splats(pipeline.source.project(gaussians, camera, pipeline), grid, model)
     order = group_features(pipeline.order.for_camera(camera), bins)
     return Frame(pipeline, camera, order, order.composite(bins, order.records(bins)))
-
-
-def project_splats(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
-    """Project ``gaussians`` and store the inputs of compositing; see :func:`render`."""
-    rows = load_rows(gaussians, pipeline.sh_degree)
-    splats = pipeline.project(rows, camera)
-    columns = pipeline.feature_columns(splats, rows, camera)
-    grid, model = TileGrid(camera.width, camera.height), pipeline.model.for_camera(camera)
-    order = pipeline.order.for_camera(camera)
-    keys, splats = order.keys(splats), replace(splats, depths=order.sort_depths(splats))
-    return splat_table(splats, grid, columns, model, keys)
 
 
 def render_again(frame: Frame, model: ImageModel) -> Frame:

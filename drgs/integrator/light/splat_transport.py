@@ -284,7 +284,9 @@ def _probes(
             from drgs.effects.smoothing import apply_smoothing
 
             pipeline = replace(pipeline, rows=apply_smoothing)
-        probes = Probes.render(gaussians, pipeline, centers, splats.near, _decode, planes)
+        probes = Probes.render(
+            gaussians, pipeline, centers, splats.near, mi.math.srgb_to_linear, planes
+        )
         _warn_of_close(splats, objects, flat, probes)
         return probes
 
@@ -398,7 +400,3 @@ def _over_black(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
     """Decode with black as the last splat: return D(C), given A D(C / A) and A."""
     display = mi.math.linear_to_srgb(color / dr.select(coverage > 0, coverage, 1))
     return mi.math.srgb_to_linear(coverage * display)
-
-
-def _decode(color: list[mi.Float]) -> list[mi.Float]:
-    return [mi.math.srgb_to_linear(channel) for channel in color]

@@ -19,6 +19,7 @@ from typing import Any, cast
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from typing_extensions import override
 
 from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.core.arrays import (
@@ -45,12 +46,11 @@ from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (
     NO_FAULT,
     CameraGradients,
-    DirectProjection,
     Frame,
     GaussianGradients,
     Pipeline,
+    ProjectionStage,
     gradients_by_row,
-    project_splats,
     sum_of_gradients,
     sum_of_views,
     weighted_sums,
@@ -168,11 +168,8 @@ class _View:
     first_nonfinite: UInt32 = field(init=False)
 
 
-class ViewExchange:
-    """The projection of a step's views, and the way back of their derivatives.
-
-    It is the integrator's projection stage (:class:`drgs.splatting.rendering.ProjectionStage`).
-    """
+class ViewExchange(ProjectionStage):
+    """The projection of a step's views, and the way back of their derivatives."""
 
     def __init__(
         self,
@@ -275,15 +272,16 @@ class ViewExchange:
         renderer = self._views[view.place].renderer
         return type(value)(self.comm.broadcast(np.array(value, np.float32), renderer))
 
+    @override
     def project(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
         """Return the splats of all ranks, behind one another, as ``camera`` sees them.
 
         Between two steps, of this rank only.
         """
         if (each := self._current) is None:
-            return project_splats(gaussians, camera, pipeline)
+            return super().project(gaussians, camera, pipeline)
         time = len(each.local)
-        own = project_splats(gaussians, camera, pipeline)
+        own = super().project(gaussians, camera, pipeline)
         counts = own.rows.width, own.num_features, own.num_keys
         local = LocalProjection(camera, pipeline, own.boxes, *counts)
         each.local.append(local)
@@ -297,16 +295,13 @@ class ViewExchange:
                 parts.append(local.table(blocks))
         return _concatenate(parts)
 
+    @override
     def gradients(
-        self,
-        gaussians: Gaussians,
-        frame: Frame,
-        of_splats: SplatGradients,
-        with_camera: bool,
+        self, gaussians: Gaussians, frame: Frame, of_splats: SplatGradients, with_camera: bool
     ) -> GaussianGradients:
         """Return derivatives with respect to splats to the ranks that have projected them."""
         if (each := self._current) is None:
-            return DirectProjection().gradients(gaussians, frame, of_splats, with_camera)
+            return super().gradients(gaussians, frame, of_splats, with_camera)
         time = len(each.gradients)
         columns = self._divide(each, time, [*of_splats.geometry, *of_splats.features])
         each.gradients.append(each.local[time].gradients(columns))
@@ -332,7 +327,7 @@ class ViewExchange:
             gaussians, pipeline = dr.detach(self.integrator.gaussians), self.integrator.pipeline
             for camera in cameras:
                 composed = with_effects(pipeline, gaussians, camera)
-                splats = project_splats(gaussians, camera, composed)
+                splats = super().project(gaussians, camera, composed)
                 counts = splats.rows.width, splats.num_features, splats.num_keys
                 local = LocalProjection(camera, composed, splats.boxes, *counts)
                 rows = cast(UInt32, dr.compress(local.visible))
