@@ -29,6 +29,8 @@ from drgs.datasets.transforms import (
 class NerfstudioReader(DatasetReader):
     """Reads folders of nerfstudio and instant-ngp."""
 
+    order = 1
+
     @override
     def recognizes(self, folder: Path) -> bool:
         return (folder / "transforms.json").exists()

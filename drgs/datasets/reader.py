@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 from pydantic import BaseModel
@@ -86,6 +86,9 @@ class Photographs:
 
 class DatasetReader:
     """Base class of readers of a layout of folders."""
+
+    order: ClassVar[int] = 9
+    """Readers are asked in ascending order whether they recognize a folder."""
 
     def __init__(self, section: BaseModel | None) -> None:
         """section: the one that the reader has registered, or None."""

@@ -105,24 +105,12 @@ class FileFormat:
         return cls.metadata is None or name in cls.metadata
 
 
-FORMATS: Registry[type[FileFormat]] = Registry(
-    "file format",
-    {
-        "ply": "drgs.io.ply",
-        "compressed-ply": "drgs.io.compressed_ply",
-        "spz": "drgs.io.spz",
-        "sog": "drgs.io.sog",
-        "glb": "drgs.io.glb",
-        "splat": "drgs.io.splat",
-        "ksplat": "drgs.io.ksplat",
-        "usd": "drgs.io.usd",
-    },
-)
+FORMATS: Registry[type[FileFormat]] = Registry("file format", "drgs.formats")
 
 
 def file_formats() -> list[Extension[type[FileFormat]]]:
     """Return all formats."""
-    return [FORMATS.get(name) for name in FORMATS.names()]
+    return FORMATS.all()
 
 
 def readable_formats() -> list[Extension[type[FileFormat]]]:
