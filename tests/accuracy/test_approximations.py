@@ -131,10 +131,7 @@ def test_equal_approximations_make_equal_pipelines():
         )
 
 
-CHOSEN_MODULES = (
-    "exact", "pixel_lists", "pixel_order", "ray_colors",
-    "unscented",
-)  # fmt: skip
+CHOSEN_MODULES = ("exact", "pixel_order", "ray_colors", "unscented")
 
 PROGRAM = """
 import json, sys
