@@ -54,23 +54,18 @@ class CameraSensor(Protocol):
 
     def camera_parameters(self) -> list[str]:
         """Return the parameters that the camera depends on, named as by ``mi.traverse``."""
-        ...
 
     def camera_from_state(self, state: SensorState) -> Camera:
         """Return the camera with these values of its parameters; OpenCV axes, px."""
-        ...
 
     def num_poses(self) -> int:
         """Return the number of poses whose images are averaged: 1 unless motion blurs them."""
-        ...
 
     def near_clip(self) -> float:
         """Return the near clip distance, scene units."""
-        ...
 
     def far_clip(self) -> float:
         """Return the far clip distance, scene units."""
-        ...
 
 
 def num_poses(sensor: mi.Sensor) -> int:
@@ -133,10 +128,7 @@ def camera_from_sensor(state: SensorState) -> Camera:
 
 
 def accumulate_in_sensor(cameras: Sequence[Camera], gradients: list[list[Float]]) -> None:
-    """Accumulate derivatives by ``Camera.numbers()``, by time, into the sensor of the cameras.
-
-    cameras: from :func:`attached_cameras`.
-    """
+    """Accumulate derivatives by ``Camera.numbers()``, by time; see :func:`attached_cameras`."""
     numbers = chain(*(camera.numbers() for camera in cameras))
     pairs = zip(numbers, chain(*gradients), strict=True)
     attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]

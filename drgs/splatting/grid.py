@@ -171,10 +171,7 @@ def load_pixels(plane: Float, lanes: Lanes, grid: TileGrid) -> list[Float]:
 
 
 def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[UInt32, Bool]]:
-    """Return row-major index and on-film mask of the 16 pixels of each micro-tile.
-
-    The index is that in a plane of all samples.
-    """
+    """Return index (in a plane of all samples) and on-film mask of each micro-tile's 16 pixels."""
     UInt32 = type(lanes.x)
     width, height = dr.opaque(UInt32, grid.width), dr.opaque(UInt32, grid.height)
     first_row, pixels = lanes.sample * height, []

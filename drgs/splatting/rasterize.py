@@ -93,11 +93,7 @@ class CompositedTiles:
     count: int  # C, planes
 
     def planes(self) -> list[Float]:
-        """Return 1 + C planes in row-major pixel order, Float (samples * H * W,), not evaluated.
-
-        The first is T, the transmittance of the background; then sum_i w_i c_i for each component
-        of c.
-        """
+        """Return T, then sum_i w_i c_i: Float (samples * H * W,) each, row-major, not evaluated."""
         return self.unpack(self.values)
 
     def unpack(self, values: Float) -> list[Float]:
@@ -167,10 +163,7 @@ class Records:
 
 
 def composite(bins: TileBins, records: Records) -> CompositedTiles:
-    """Composite the features of all splats.
-
-    bins: from ``bin_splats``; records: ``Records.from_ranks(bins, bins.rows.load)``.
-    """
+    """Composite the features of all splats; records: of ``bins.rows.load``."""
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
     end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)

@@ -116,10 +116,7 @@ class Frame:
     tiles: CompositedTiles  # of that order
 
     def planes(self) -> list[Float]:
-        """Return transmittance, then the pipeline's features, unevaluated.
-
-        Each is Float (samples * H * W,), sample by sample.
-        """
+        """Return transmittance, then the features: see :meth:`.CompositedTiles.planes`."""
         return self.tiles.planes()
 
 

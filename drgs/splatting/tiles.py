@@ -106,9 +106,8 @@ def splat_table(
 def bin_splats(table: SplatTable, grid: TileGrid, model: ImageModel) -> TileBins:
     """Distribute splats over the tiles of ``grid``, front to back.
 
-    Not differentiated. The host reads one value, the number of entries.
-
-    Raises UserError if there are more than 2^26 Gaussians.
+    Not differentiated. The host reads one value, the number of entries. Raises UserError if there
+    are more than 2^26 Gaussians.
     """
     boxes, rows, depths = table.boxes, table.rows, table.depths
     num_features, num_keys = table.num_features, table.num_keys
@@ -416,10 +415,7 @@ class Entries:
 
     @staticmethod
     def current(cursor: Cursor) -> tuple[UInt32, Bool]:
-        """The current sorted entry, and whether there is one (a word may be empty).
-
-        Where there is none, it is one of the entries of the cursor's group.
-        """
+        """The current sorted entry, and whether there is one; else it is any of its group."""
         return cursor.group * WORD + find_lowest_bit(cursor.word), cursor.word != 0
 
     def advance(self, cursor: Cursor) -> Cursor:
