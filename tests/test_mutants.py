@@ -377,7 +377,7 @@ FUNCTIONS = """
     rasterize.composite_tangent rasterize.pack_tangents footprint.GaussianFalloff.moments
     footprint.GaussianFalloff.derivatives footprint.GaussianFalloff.tangent
     footprint.GaussianFalloff.pack_tangents footprint.SplatFeatures.add_derivatives
-    footprint.PixelCenters.sum_dx rendering.frames_tangent rendering.gradients_of
+    footprint.PixelCenters.sum_dx rendering.frames_tangent
     rendering._back_to_rows rendering.gradients_by_row rendering._as_tensors
     losses._ssim_and_partials losses._assemble_gradient losses._PhotometricOp.backward
     losses._PhotometricOp.forward losses.l1_loss exact.RayFalloff.moments

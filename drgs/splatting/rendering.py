@@ -193,8 +193,10 @@ def frames_adjoint(
     """
     of_splats, first = splats_adjoint(frames, d_planes), frames[0]
     given = CameraGradients(first.camera, first.pipeline, of_splats)
-    gradients = gradients_of(gaussians, given, with_camera)
-    return replace(gradients, visible=on_film(first.tiles.bins))
+    total, by_row = gradients_by_row(gaussians, given, with_camera)
+    # dr.sum adds in the same order in every run.
+    camera = [dr.sum(each) for each in by_row] if with_camera else None
+    return replace(total, visible=on_film(first.tiles.bins), camera=camera)
 
 
 def splats_adjoint(frames: list[Frame], d_planes: list[list[Float]]) -> SplatGradients:
@@ -224,24 +226,13 @@ class CameraGradients:
     gradients: SplatGradients
 
 
-def gradients_of(
-    gaussians: Gaussians, given: CameraGradients, with_camera: bool = False
-) -> GaussianGradients:
-    """Return derivatives of the parameters, given those of the 2D splats, by Dr.Jit.
-
-    See :func:`frames_adjoint`; ``visible`` does not include the bounds of the film.
-    """
-    total, by_row = gradients_by_row(gaussians, given, with_camera)
-    # dr.sum adds in the same order in every run.
-    return replace(total, camera=[dr.sum(each) for each in by_row]) if with_camera else total
-
-
 def gradients_by_row(
-    gaussians: Gaussians, given: CameraGradients, with_camera: bool
+    gaussians: Gaussians, given: CameraGradients, with_camera: bool = False
 ) -> tuple[GaussianGradients, list[Float]]:
-    """Return :func:`gradients_of`, and each Gaussian's contribution to the camera's derivatives.
+    """Return derivatives of the parameters, and each Gaussian's contribution to the camera's.
 
-    Contributions are evaluated: (N,) for each of ``camera.numbers()``; none without
+    Dr.Jit computes them from those of the 2D splats; ``visible`` does not include the bounds of the
+    film. Contributions are evaluated: (N,) for each of ``camera.numbers()``; none without
     ``with_camera``.
     """
     rows = load_rows(gaussians, given.pipeline.sh_degree)
@@ -257,7 +248,7 @@ def gradients_by_row(
 def sum_of_views(
     gaussians: Gaussians, views: Sequence[Sequence[CameraGradients]]
 ) -> tuple[Gaussians, list[UInt32]]:
-    """Sum :func:`gradients_of` over several views, in one kernel.
+    """Sum :func:`gradients_by_row` over several views, in one kernel.
 
     views: the derivatives at each time of each view, added in this order. Shared values are
     computed once, and the sum stays in registers.
