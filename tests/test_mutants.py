@@ -383,7 +383,7 @@ FUNCTIONS = """
     losses._PhotometricOp.forward losses.l1_loss exact.RayFalloff.moments
     exact.RayFalloff.derivatives exact.RayFalloff.tangent exact.RayFalloff.pack_tangents
     pixel_order._add_product pixel_order._totals pixel_order._pairs
-    pixel_order._sum_pixels pixel_order._tangent ray_colors.RayColors.add_derivatives
+    pixel_order._sum_pixels pixel_order.PixelOrder.tangent ray_colors.RayColors.add_derivatives
     ray_colors.RayColors.tangents
 """
 """Functions that have mutants, at least these: derivatives are found by their callers."""

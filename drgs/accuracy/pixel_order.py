@@ -109,7 +109,39 @@ class PixelOrder(CenterOrder):
 
     @override
     def composite(self, bins: TileBins, records: Records) -> _OrderedTiles:
-        return _composite(bins, records, self)
+        t = types_of(bins.rows.Float)
+        lists = PixelLists.build(bins, records, self.depths)
+        inputs = _WalkInputs.from_lists(bins, records, lists, self)
+        lanes, model, size = inputs.lanes, inputs.model, inputs.size
+        count = model.features.num_planes(bins.num_features)
+
+        def visit(state: tuple, visited: list[list[Float]]) -> tuple:
+            T, C = list(state[0]), [list(plane) for plane in state[1]]
+            for pixel, (alpha, *features) in enumerate(visited):
+                weight, T[pixel], _ = composite_step(T[pixel], alpha, inputs.stop)
+                for k, c in enumerate(features):
+                    C[k][pixel] = dr.fma(weight, c, C[k][pixel])
+            return (T, C), any_unfinished(T)
+
+        T, C = _walk(
+            inputs,
+            carry=lambda met, pixel: model.features.pixel_values(met.features, pixel),
+            visit=visit,
+            state=(inputs.transmittance(), inputs.zeros(count)),
+            nothing=[dr.zeros(t.Float, size)] * count,
+        )
+        dr.eval(T, C)
+        columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
+        last = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
+        return _OrderedTiles(
+            bins=bins,
+            records=records,
+            values=scatter_rows(columns, lanes.micro_tile, size),
+            ends=scatter_rows([last] * PIXELS, lanes.micro_tile, size),
+            stop=scatter_rows([last], lanes.micro_tile, size),
+            count=count,
+            lists=lists,
+        )
 
     @override
     def adjoint(
@@ -127,7 +159,45 @@ class PixelOrder(CenterOrder):
 
     @override
     def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
-        return _tangent(_WalkInputs.from_tiles(tiles, self), tiles, tangents)
+        inputs = _WalkInputs.from_tiles(tiles, self)
+        bins, model, size = inputs.bins, inputs.model, inputs.size
+        d_records, count = pack_tangents(bins, tangents), tiles.count
+
+        def carry(met: _Crossing, pixel: int) -> list[Float]:
+            d_geometry, d_features = d_records.load(met.entry, met.active)
+            d_log_alpha = model.falloff.tangent(met.geometry, met.footprint, d_geometry)[pixel]
+            alpha = met.alphas[pixel]
+            return [
+                dr.select(alpha.smooth, alpha.value * d_log_alpha, 0),
+                *model.features.pixel_values(met.features, pixel),
+                *model.features.tangents(met.features, d_features, pixel),
+            ]
+
+        def visit(state: tuple, visited: list[list[Float]]) -> tuple:
+            T, dT = list(state[0]), list(state[1])
+            dC = [list(plane) for plane in state[2]]
+            for pixel, (alpha, d_alpha, *features) in enumerate(visited):
+                # Behind the camera, there is a footprint.
+                d_alpha = dr.select(alpha > 0, d_alpha, 0)
+                before, d_before = dr.abs(T[pixel]), dT[pixel]
+                weight, T[pixel], goes_on = composite_step(T[pixel], alpha, inputs.stop)
+                d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha * d_before), 0)
+                dT[pixel] = d_before - d_weight
+                for k in range(count):
+                    change = dr.fma(d_weight, features[k], weight * features[count + k])
+                    dC[k][pixel] = dC[k][pixel] + change
+            return (T, dT, dC), any_unfinished(T)
+
+        _, dT, dC = _walk(
+            inputs,
+            carry=carry,
+            visit=visit,
+            state=(inputs.transmittance(), inputs.zeros(1)[0], inputs.zeros(count)),
+            nothing=[dr.zeros(bins.rows.Float, size)] * (1 + 2 * count),
+        )
+        columns = dT + [v for plane in dC for v in plane]
+        dr.eval(columns)
+        return tiles.unpack(scatter_rows(columns, inputs.lanes.micro_tile, size))
 
 
 MAX_DEPTH_RATIO = 4.0
@@ -409,42 +479,6 @@ class _OrderedTiles(CompositedTiles):
     lists: PixelLists
 
 
-def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedTiles:
-    t = types_of(bins.rows.Float)
-    lists = PixelLists.build(bins, records, order.depths)
-    inputs = _WalkInputs.from_lists(bins, records, lists, order)
-    lanes, model, size = inputs.lanes, inputs.model, inputs.size
-    count = model.features.num_planes(bins.num_features)
-
-    def visit(state: tuple, visited: list[list[Float]]) -> tuple:
-        T, C = list(state[0]), [list(plane) for plane in state[1]]
-        for pixel, (alpha, *features) in enumerate(visited):
-            weight, T[pixel], _ = composite_step(T[pixel], alpha, inputs.stop)
-            for k, c in enumerate(features):
-                C[k][pixel] = dr.fma(weight, c, C[k][pixel])
-        return (T, C), any_unfinished(T)
-
-    T, C = _walk(
-        inputs,
-        carry=lambda met, pixel: model.features.pixel_values(met.features, pixel),
-        visit=visit,
-        state=(inputs.transmittance(), inputs.zeros(count)),
-        nothing=[dr.zeros(t.Float, size)] * count,
-    )
-    dr.eval(T, C)
-    columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
-    last = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
-    return _OrderedTiles(
-        bins=bins,
-        records=records,
-        values=scatter_rows(columns, lanes.micro_tile, size),
-        ends=scatter_rows([last] * PIXELS, lanes.micro_tile, size),
-        stop=scatter_rows([last], lanes.micro_tile, size),
-        count=count,
-        lists=lists,
-    )
-
-
 def _feature_gradient(
     inputs: _WalkInputs, met: _Crossing, pixel: int, g: list[list[Float]]
 ) -> Float | int:
@@ -574,43 +608,3 @@ def _add_product(high: Float, low: Float, a: Float, b: Float) -> tuple[Float, Fl
     part = total - high
     lost = (high - (total - part)) + (product - part)
     return total, low + (lost + rest)
-
-
-def _tangent(inputs: _WalkInputs, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
-    bins, model, size = inputs.bins, inputs.model, inputs.size
-    d_records, count = pack_tangents(bins, tangents), tiles.count
-
-    def carry(met: _Crossing, pixel: int) -> list[Float]:
-        d_geometry, d_features = d_records.load(met.entry, met.active)
-        d_log_alpha = model.falloff.tangent(met.geometry, met.footprint, d_geometry)[pixel]
-        alpha = met.alphas[pixel]
-        return [
-            dr.select(alpha.smooth, alpha.value * d_log_alpha, 0),
-            *model.features.pixel_values(met.features, pixel),
-            *model.features.tangents(met.features, d_features, pixel),
-        ]
-
-    def visit(state: tuple, visited: list[list[Float]]) -> tuple:
-        T, dT = list(state[0]), list(state[1])
-        dC = [list(plane) for plane in state[2]]
-        for pixel, (alpha, d_alpha, *features) in enumerate(visited):
-            d_alpha = dr.select(alpha > 0, d_alpha, 0)  # behind the camera, there is a footprint
-            before, d_before = dr.abs(T[pixel]), dT[pixel]
-            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, inputs.stop)
-            d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha * d_before), 0)
-            dT[pixel] = d_before - d_weight
-            for k in range(count):
-                change = dr.fma(d_weight, features[k], weight * features[count + k])
-                dC[k][pixel] = dC[k][pixel] + change
-        return (T, dT, dC), any_unfinished(T)
-
-    _, dT, dC = _walk(
-        inputs,
-        carry=carry,
-        visit=visit,
-        state=(inputs.transmittance(), inputs.zeros(1)[0], inputs.zeros(count)),
-        nothing=[dr.zeros(bins.rows.Float, size)] * (1 + 2 * count),
-    )
-    columns = dT + [v for plane in dC for v in plane]
-    dr.eval(columns)
-    return tiles.unpack(scatter_rows(columns, inputs.lanes.micro_tile, size))

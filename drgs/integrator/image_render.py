@@ -100,24 +100,18 @@ class ImageRender:
             has_alpha=mi.has_flag(film.flags(), mi.FilmFlags.Alpha),
             nested=nested,
         )
-        if not is_batch(sensor):
-            return ImageRender([whole], samples, nested)._with_surfaces()
-        batch = SideBySide.from_batch(sensor)
-        views = [
-            replace(
-                whole, index=index, sensor=one, positions=batch.positions(whole.positions, index)
-            )
-            for index, one in enumerate(batch.sensors)
-        ]
-        return ImageRender(views, samples, nested, batch)._with_surfaces()
-
-    def _with_surfaces(self) -> ImageRender:
-        if self.nested is None:
-            return self
-        count = max(view.num_surfaces(self.nested) for view in self.views)
-        nested = self.nested.with_surfaces(count)
-        self.samples.aovs += nested.compositor.channels
-        return replace(self, views=[replace(v, nested=nested) for v in self.views], nested=nested)
+        batch, views = None, [whole]
+        if is_batch(sensor):
+            batch = SideBySide.from_batch(sensor)
+            views = [
+                replace(whole, index=k, sensor=one, positions=batch.positions(whole.positions, k))
+                for k, one in enumerate(batch.sensors)
+            ]
+        if nested is not None:
+            nested = nested.with_surfaces(max(view.num_surfaces(nested) for view in views))
+            samples.aovs += nested.compositor.channels
+            views = [replace(view, nested=nested) for view in views]
+        return ImageRender(views, samples, nested, batch)
 
     def image(self) -> mi.TensorXf:
         """Return the developed image."""

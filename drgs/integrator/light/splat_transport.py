@@ -43,7 +43,7 @@ from drgs.core.arrays import reinterpret
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.film import decode
-from drgs.integrator.light.rays import PathSegment, SplatTransport, TransportIntegrator
+from drgs.integrator.light.rays import PathSegment, SplatTransport
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import SplatsState
 from drgs.light.probe import CUBE_SIZE_TEXELS, LOW_PASS, NUM_LEVELS, ProbeHit, Probes
@@ -141,20 +141,13 @@ def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: 
     return RaySplats.from_gaussians(rows, degree, pipeline_of(approximations, degree).model.cutoffs)
 
 
-def nested_with_transport(
+def transport_of(
     splats: SplatsState, scene: mi.Scene, num_paths: int, sensors: Sequence[mi.Sensor]
-) -> mi.SamplingIntegrator:
-    """Return the nested integrator with its splats; num_paths: per pixel; sensors: rendered."""
-    nested: mi.SamplingIntegrator | None = splats.nested
-    if nested is None:
-        settings = {"type": "splatpath", "hide_emitters": splats.hide_emitters}
-        nested = mi.load_dict(settings)
-    assert isinstance(nested, TransportIntegrator), "checked with the settings"
+) -> SplatTransport:
+    """Return the transport of an integrator's light; num_paths: per pixel; sensors: rendered."""
     if splats.lighting.light == "rays":
-        nested.use_transport(RayTransport.from_splats(splats))
-    else:
-        nested.use_transport(ProbeTransport.from_splats(splats, scene, num_paths, sensors))
-    return nested
+        return RayTransport.from_splats(splats)
+    return ProbeTransport.from_splats(splats, scene, num_paths, sensors)
 
 
 def _segment(ray: mi.Ray3f, active: mi.Bool) -> Segment:

@@ -264,25 +264,22 @@ class NestedSurfaces:
         cache, hide_emitters = splats.cache, splats.hide_emitters
         surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
         count = splats.nested_spp or spp
-        nested: mi.SamplingIntegrator
-        adjoint: mi.SamplingIntegrator
-        if splats.lighting.light != "none":
-            from drgs.integrator.light.splat_transport import nested_with_transport
+        is_lit, nested = splats.lighting.light != "none", splats.nested
+        if nested is None:
+            # The same paths as ``path``, with correct derivatives for more parameters, and lamps
+            # seen through transparent surfaces.
+            nested = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
+        adjoint: mi.SamplingIntegrator = nested
+        if splats.nested is None and not (is_lit or surfaces.is_transparent):
+            nested = mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
+        if isinstance(nested, TransportIntegrator):
+            transport = None  # another integrator may have given it one
+            if is_lit:
+                from drgs.integrator.light.splat_transport import transport_of
 
-            num_paths = count or sensor.sampler().sample_count()
-            nested = adjoint = nested_with_transport(splats, scene, num_paths, sensors_of(sensor))
-        else:
-            if splats.nested is not None:
-                nested = adjoint = splats.nested
-            else:
-                # The same paths as ``path``, with correct derivatives for more parameters, and
-                # lamps seen through transparent surfaces.
-                adjoint = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
-                nested = adjoint
-                if not surfaces.is_transparent:
-                    nested = mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
-            if isinstance(nested, TransportIntegrator):
-                nested.use_transport(None)  # another integrator may have given it one
+                num_paths = count or sensor.sampler().sample_count()
+                transport = transport_of(splats, scene, num_paths, sensors_of(sensor))
+            nested.use_transport(transport)
         compositor = SurfaceCompositor(
             sensor.film(),
             cache.film_maps,
