@@ -55,11 +55,6 @@ def num_samples(film: mi.Film, x: Float | float) -> int:
     return max(dr.width(x) // dr.prod(film.crop_size()), 1)
 
 
-def sample_offsets(positions: SamplePositions) -> tuple[Float | float, Float | float]:
-    """Return x and y of sample positions from their pixels' upper left corners, px."""
-    return (positions.x, positions.y) if isinstance(positions, SamplePoints) else (0.5, 0.5)
-
-
 def decode(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
     """Return linear radiance A D(C / A); color: C, display space; coverage: A, sum of weights."""
     return coverage * mi.math.srgb_to_linear(color / dr.select(coverage > 0, coverage, 1))

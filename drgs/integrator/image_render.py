@@ -28,9 +28,9 @@ from drgs.integrator.film import (
     CenterSamples,
     Channels,
     DrawnSamples,
+    SamplePoints,
     background_radiance,
     decode,
-    sample_offsets,
 )
 from drgs.integrator.sensors import (
     SensorState,
@@ -462,7 +462,8 @@ class SensorRender:
 
     @property
     def _offsets(self) -> list[tuple[Float | float, Float | float]]:
-        return [sample_offsets(positions) for positions in self.positions]
+        """Return x and y of each pass's samples from their pixels' upper left corners, px."""
+        return [(p.x, p.y) if isinstance(p, SamplePoints) else (0.5, 0.5) for p in self.positions]
 
     def _state(self) -> SensorState:
         return read_sensor(self.sensor, self.splats.near)

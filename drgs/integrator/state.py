@@ -21,6 +21,7 @@ from drgs.core.constants import MAX_FEATURES
 from drgs.core.errors import PluginError, UnsupportedError
 from drgs.core.private import same_variables
 from drgs.core.types import Bool, Float, TensorXf, UInt32
+from drgs.effects.compose import NamedFeature, normal_features
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting import rendering
 from drgs.splatting.rasterize import SplatGradients
@@ -170,11 +171,6 @@ class SplatsState:
         return own | {f"{name}.": one for name, one in self.nested_objects.items()}
 
     @property
-    def has_smoothing(self) -> bool:
-        """True if Gaussians have a smoothing filter, ignored or not."""
-        return any(one.gaussians.smoothing is not None for one in self.objects.values())
-
-    @property
     def sh_degree(self) -> int:
         """Highest spherical harmonics degree that is evaluated."""
         if self.given_degree is not None:
@@ -217,7 +213,8 @@ class SplatsState:
         settings = self.approximations, self.sh_degree, of_smoothing, kinds
 
         def make() -> rendering.Pipeline:
-            others = [feature_of(kind) for kind in kinds if kind != "alpha"]
+            own = {"depth": rendering.depth_feature, "normal": normal_features}
+            others = [own.get(kind) or NamedFeature(kind) for kind in kinds if kind != "alpha"]
             pipeline = pipeline_of(*settings[:2], (rendering.color_features, *others))
             return replace(pipeline, of_smoothing=of_smoothing)
 
@@ -473,15 +470,6 @@ def feature_widths(objects: dict[str, SplatObject]) -> dict[str, int]:
                     f"objects' {name}, got {value.shape[1]}"
                 )
     return widths
-
-
-def feature_of(kind: str) -> rendering.Feature:
-    """Return the composited feature of an AOV of this kind, other than alpha."""
-    if kind == "depth":
-        return rendering.depth_feature
-    from drgs.effects.compose import NamedFeature, normal_features
-
-    return normal_features if kind == "normal" else NamedFeature(kind)
 
 
 if TYPE_CHECKING:

@@ -114,7 +114,8 @@ def _summary_of_integrator(
             "the Gaussians' filter" if smooth else None,
         ),
     ]
-    if splats.has_smoothing and not smooth:
+    own = [one.gaussians.smoothing for one in splats.objects.values()]
+    if not smooth and any(filters is not None for filters in own):
         effects.append(SimulatedEffect("smoothing filter", None, ignored=True))
     others = splats.approximations.non_default
     values = [f"{k} = {v}" for k, v in others.items() if k in from_header and k != "antialiased"]

@@ -14,15 +14,10 @@ from drgs.core.types import Bool, Float, UInt32
 
 T = TypeVar("T", Float, UInt32)
 
-MICRO = 4
-"""Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
-
+MICRO = 4  # pixels on the side of a micro-tile, one SIMD lane of the compositing kernels
 PIXELS = MICRO * MICRO  # pixels of a micro-tile
-
 GRID = 4  # micro-tiles on a tile's side
-
 TILE = MICRO * GRID  # pixels on a tile's side
-
 MICROS = GRID * GRID  # micro-tiles in a tile: the bits of an entry's mask
 
 
