@@ -264,11 +264,6 @@ class SplatGradients:
         """Derivatives of the means on the film, loss per px."""
         return types_of(type(self.geometry[0])).Array2f(self.geometry[:2])
 
-    @property
-    def opacities(self) -> Float:
-        """Derivatives of the opacities."""
-        return self.geometry[5]
-
 
 def composite_adjoint(
     tiles: CompositedTiles,
