@@ -54,18 +54,23 @@ class CameraSensor(Protocol):
 
     def camera_parameters(self) -> list[str]:
         """Return the parameters that the camera depends on, named as by ``mi.traverse``."""
+        ...
 
     def camera_from_state(self, state: SensorState) -> Camera:
         """Return the camera with these values of its parameters; OpenCV axes, px."""
+        ...
 
     def num_poses(self) -> int:
         """Return the number of poses whose images are averaged: 1 unless motion blurs them."""
+        ...
 
     def near_clip(self) -> float:
         """Return the near clip distance, scene units."""
+        ...
 
     def far_clip(self) -> float:
         """Return the far clip distance, scene units."""
+        ...
 
 
 def num_poses(sensor: mi.Sensor) -> int:

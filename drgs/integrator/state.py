@@ -489,9 +489,11 @@ if TYPE_CHECKING:
 
         def forget_frames(self) -> None:
             """Clear the cached frames."""
+            ...
 
         def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str:
             """Return a summary of the simulated effects."""
+            ...
 
 else:
     SplatsPlugin = Any

@@ -194,9 +194,11 @@ class SplatTransport(Protocol):
         self, segment: PathSegment, sample: mi.Float, active: mi.Bool
     ) -> tuple[mi.Color3f, mi.Float]:
         """Return linear radiance and transmittance of segments; sample: in 0..1."""
+        ...
 
     def transmittance(self, segment: PathSegment, sample: mi.Float, active: mi.Bool) -> mi.Float:
         """Return the transmittance of the splats along segments, or an estimate of it."""
+        ...
 
 
 @runtime_checkable

@@ -264,12 +264,12 @@ class NestedSurfaces:
         cache, hide_emitters = splats.cache, splats.hide_emitters
         surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
         count = splats.nested_spp or spp
-        is_lit, nested = splats.lighting.light != "none", splats.nested
-        if nested is None:
-            # The same paths as ``path``, with correct derivatives for more parameters, and lamps
-            # seen through transparent surfaces.
-            nested = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
-        adjoint: mi.SamplingIntegrator = nested
+        is_lit = splats.lighting.light != "none"
+        # The same paths as ``path``, with correct derivatives for more parameters, and lamps seen
+        # through transparent surfaces.
+        default = {"type": "splatpath", "hide_emitters": hide_emitters}
+        nested: mi.SamplingIntegrator = splats.nested or mi.load_dict(default)
+        adjoint = nested
         if splats.nested is None and not (is_lit or surfaces.is_transparent):
             nested = mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
         if isinstance(nested, TransportIntegrator):
