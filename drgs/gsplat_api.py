@@ -47,13 +47,12 @@ OPAQUE_LOGIT = 100.0  # its sigmoid is 1 in float64
 
 GSPLAT_REMEDIES = {
     "far_plane": "leave out the Gaussians beyond it",
-    "radius_clip": "leave it out: small splats cost little",
-    "packed sparse_grad": "leave it out: results and gradients have a row for each Gaussian",
-    "absgrad": "leave it out: gradients are summed with their signs",
     "covars": "give quats and scales",
     "with_ut": 'give projection="unscented"',
     "with_eval3d": 'give projection="exact"',
-    "tile_size channel_chunk distributed segmented": "leave it out",
+    "absgrad channel_chunk distributed packed radius_clip segmented sparse_grad tile_size": (
+        "leave it out"
+    ),
     "camera_model radial_coeffs tangential_coeffs thin_prism_coeffs ftheta_coeffs rolling_shutter "
     "viewmats_rs": "leave it out for pinholes at rest; other cameras are Mitsuba's sensors, which "
     "mi.render takes with the integrator splats",

@@ -138,7 +138,7 @@ class Case:
     def is_differentiable_in_camera(self) -> bool:
         """Whether the pipeline has derivatives with respect to the camera."""
         try:
-            self.pipeline.model.check_differentiable_in_camera()
+            self.pipeline.model.features.check_differentiable_in_camera()
         except UnsupportedError:
             return False
         return True

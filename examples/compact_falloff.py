@@ -16,7 +16,7 @@ from dataclasses import replace
 import drjit as dr
 
 from drgs.config.approximations import FALLOFFS
-from drgs.splatting.footprint import GaussianFalloff, flat_columns
+from drgs.splatting.footprint import GaussianFalloff
 
 POWER = 4.5
 END = 9 / (2 * math.log(2))  # kernels scale U such that a Gaussian is 2^-t
@@ -51,6 +51,6 @@ class CompactFalloff(GaussianFalloff):
 
 def _slopes(footprint):
     """Return 1 / (1 - t / END), the slope of ln(alpha) over that of a Gaussian's; 0 at the end."""
-    pairs = zip(flat_columns(footprint.u), flat_columns(footprint.v), strict=True)
+    pairs = zip(footprint.u, footprint.v, strict=True)
     rests = [1 - (u * u + v * v) / END for u, v in pairs]
     return [dr.select(rest > 0, 1 / dr.select(rest > 0, rest, 1), 0) for rest in rests]

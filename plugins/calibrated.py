@@ -39,18 +39,15 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
 PROPERTIES = {
-    "fx": positive(1.0),
-    "cx": number(0.0),
-    "cy": number(0.0),
     "near_clip": positive(0.01),
     "far_clip": positive(1e4),
     "shutter": one_of("global", "rolling"),
     "shutter_samples": integer(SHUTTER_SAMPLES, 1, MAX_SHUTTER_SAMPLES),
 }
-"""Single values besides coefficients; defaults in pixels depend on the film."""
+"""Single values besides intrinsics, whose defaults depend on the film, and coefficients."""
 
 KNOWN = (
-    *("to_world", "to_world_close", "fy", "lens", *COEFFICIENTS, *PROPERTIES),
+    *("to_world", "to_world_close", *INTRINSICS, "lens", *COEFFICIENTS, *PROPERTIES),
     *("shutter_open", "shutter_close"),
 )
 """Names of the properties, besides those of all Mitsuba sensors."""

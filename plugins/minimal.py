@@ -16,7 +16,7 @@ from drgs.splatting.footprint import DEFAULT
 from drgs.splatting.grid import TileGrid
 from drgs.splatting.projection import load_rows
 from drgs.splatting.rasterize import CompositedTiles, Records, composite, composite_adjoint
-from drgs.splatting.rendering import Pipeline, gradients_of
+from drgs.splatting.rendering import CameraGradients, Pipeline, gradients_by_row
 from drgs.splatting.tiles import bin_splats, splat_table
 
 
@@ -76,7 +76,8 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
                 dr.traverse(dr.ADMode.Backward)
                 d_planes = dr.grad(planes)
             of_splats = composite_adjoint(tiles, d_planes)
-            gradients = gradients_of(self._gaussians, camera, self.pipeline, of_splats).parameters
+            given = CameraGradients(camera, self.pipeline, of_splats)
+            gradients = gradients_by_row(self._gaussians, given)[0].parameters
         for name in PARAMETER_NAMES:
             if dr.grad_enabled(getattr(self, name)):
                 dr.accum_grad(getattr(self, name), getattr(gradients, name))

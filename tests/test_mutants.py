@@ -360,9 +360,6 @@ ELSEWHERE = {
             "self(image, target)",
         )
     },
-    "footprint._productsreturn [a * b for a, b in zip(values, flat_columns(grid), strict=True)]": (
-        "test_sampling: points anywhere in pixels"
-    ),
     "footprint.Cutoffs.log2_floorat_extent > least": "the package's own cut-offs are used",
     **dict.fromkeys(
         (
@@ -380,13 +377,13 @@ FUNCTIONS = """
     rasterize.composite_tangent rasterize.pack_tangents footprint.GaussianFalloff.moments
     footprint.GaussianFalloff.derivatives footprint.GaussianFalloff.tangent
     footprint.GaussianFalloff.pack_tangents footprint.SplatFeatures.add_derivatives
-    footprint.PixelCenters.sum_dx rendering._splat_tangents rendering.gradients_of
+    footprint.PixelCenters.sum_dx rendering.frames_tangent
     rendering._back_to_rows rendering.gradients_by_row rendering._as_tensors
     losses._ssim_and_partials losses._assemble_gradient losses._PhotometricOp.backward
     losses._PhotometricOp.forward losses.l1_loss exact.RayFalloff.moments
     exact.RayFalloff.derivatives exact.RayFalloff.tangent exact.RayFalloff.pack_tangents
-    pixel_order._adjoint pixel_order._add_product pixel_order._totals pixel_order._pairs
-    pixel_order._sum_pixels pixel_order._tangent ray_colors.RayColors.add_derivatives
+    pixel_order._add_product pixel_order._totals pixel_order._pairs
+    pixel_order._sum_pixels pixel_order.PixelOrder.tangent ray_colors.RayColors.add_derivatives
     ray_colors.RayColors.tangents
 """
 """Functions that have mutants, at least these: derivatives are found by their callers."""

@@ -87,14 +87,8 @@ def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:
     ewa, unscented = Level({"projection": "ewa"}, 1), Level({"projection": "unscented"}, 1.03)
     if all(isinstance(camera.lens, Pinhole) for camera in cameras):
         return ewa, Level({"projection": "exact"}, 1.2, 1.05)
-    # DirectProjection along parallel rays, Gaussians are Gaussians.
+    # Along parallel rays, projected Gaussians are Gaussians.
     return (ewa,) if all(camera.lens.parallel for camera in cameras) else (ewa, unscented)
-
-
-def own_samples(cameras: Sequence[Camera]) -> int:
-    """Return the largest number of times of an open shutter; 0: no camera has one."""
-    shutters = [one.shutter for one in cameras]
-    return max((one.samples for one in shutters if isinstance(one, MotionBlur)), default=0)
 
 
 def shutter_samples(cameras: Sequence[Camera]) -> tuple[Level, ...]:
@@ -102,7 +96,8 @@ def shutter_samples(cameras: Sequence[Camera]) -> tuple[Level, ...]:
 
     Twice the last one is taken for exact.
     """
-    own = own_samples(cameras)
+    shutters = [one.shutter for one in cameras]
+    own = max((one.samples for one in shutters if isinstance(one, MotionBlur)), default=0)
     counts = sorted({max(1, own // 4), max(1, own // 2), own, 2 * own}) if own else []
     return tuple(Level({SAMPLES: n}, n / own) for n in counts if n <= MAX_SHUTTER_SAMPLES)
 
@@ -303,8 +298,7 @@ class Search:
         cameras = [cameras[k] for k in measured_places(len(cameras), pixels)]
         views = [renderer.view(one, (k + 0.5) / len(cameras)) for k, one in enumerate(cameras)]
         self._renderer, self._views = renderer, views
-        self._whole: dict[frozenset, list[np.ndarray]] = {}
-        self._windows: dict[frozenset, list[np.ndarray]] = {}
+        self._images: dict[tuple[str, frozenset], list[np.ndarray]] = {}
         projected = projections(cameras)
         first = projected[0], CENTER, DIRECTIONS[0], CUT_OFFS[1]
         self._start = {k: v for level in first for k, v in level.changes.items()}
@@ -329,12 +323,7 @@ class Search:
 
     def _of_views(self, changes: Changes) -> list[np.ndarray]:
         """Return the images of the views, with the cheapest approximations but for ``changes``."""
-        values = {**self._start, **changes}
-        key = frozenset(values.items())
-        if key not in self._whole:
-            found = [self._renderer.image(view.camera, values) for view in self._views]
-            self._whole[key] = found
-        return self._whole[key]
+        return self._render("camera", {**self._start, **changes})
 
     def _in_windows(self, changes: Changes) -> list[np.ndarray]:
         """Return the images of the windows, likewise."""
@@ -342,11 +331,15 @@ class Search:
         if values["order"] == CENTER.changes["order"]:
             pairs = zip(self._of_views(changes), self._views, strict=True)
             return [image[view.rows, view.columns] for image, view in pairs]
-        key = frozenset(values.items())
-        if key not in self._windows:
-            found = [self._renderer.image(view.window, values) for view in self._views]
-            self._windows[key] = found
-        return self._windows[key]
+        return self._render("window", values)
+
+    def _render(self, camera: str, values: Changes) -> list[np.ndarray]:
+        """Render once; camera: the attribute of :class:`MeasuredView`."""
+        key = camera, frozenset(values.items())
+        if key not in self._images:
+            cameras = [getattr(view, camera) for view in self._views]
+            self._images[key] = [self._renderer.image(one, values) for one in cameras]
+        return self._images[key]
 
     def _differences(self, changes: Changes, target: Sequence[np.ndarray]) -> np.ndarray:
         """Return the mean square differences (V,) of the views, from those of the windows."""
@@ -374,10 +367,7 @@ class Search:
         ]
 
     def choose(self, budget: float) -> BudgetReport:
-        """Return the cheapest approximations whose error is within ``budget``.
-
-        Raises ValueError if no combination is.
-        """
+        """Return the cheapest approximations within ``budget``; ValueError if there are none."""
         place, of_views, errors = self.cheapest(budget)
         pairs = zip(self.front, errors, strict=True)
         front = [replace(one.choice, error=error) for one, error in pairs]

@@ -1,6 +1,6 @@
 r"""Splats evaluated along each pixel's ray: the projection ``exact``, and depths at a pixel.
 
-Imported when it is selected. The affine approximation (EWA) replaces a Gaussian by one in image
+Imported when one is selected. The affine approximation (EWA) replaces a Gaussian by one in image
 space. The exact maximum along a ray is the Gaussian's peak, at little more cost.
 
 In camera axes let d be a pixel's offset from the mean on the film, in the coordinates e = U d in
@@ -45,7 +45,7 @@ extends around the camera, and its outline is unbounded.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 from typing_extensions import override
@@ -57,14 +57,10 @@ from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.errors import UnsupportedError
 from drgs.core.types import Array2f, Array3f, Bool, Float
-from drgs.splatting.footprint import (
-    GaussianFalloff,
-    MicroTileFootprint,
-    Offsets,
-    SamplePositions,
-    flat_columns,
-)
+from drgs.splatting.footprint import GaussianFalloff, MicroTileFootprint, Offsets, SamplePositions
+from drgs.splatting.grid import Lanes, TileGrid, load_pixels
 from drgs.splatting.projection import (
+    FilmProjection,
     FilmShape,
     GaussianRows,
     ProjectionModel,
@@ -154,12 +150,7 @@ class RayFootprint(MicroTileFootprint):
 
     along: list[Float]  # A = a / D: depth of the peak, divided by z_mean / |a_c|
     exponent: list[Float]  # B = |e|^2 / D, base 2
-    from_anchor: tuple[list, list]  # grids of x - c, px
-
-    @property
-    def coordinates(self) -> list[tuple[Float, Float]]:
-        """e = (u, v)."""
-        return list(zip(flat_columns(self.u), flat_columns(self.v), strict=True))
+    from_anchor: tuple[list[Float], list[Float]]  # x - c, px
 
 
 @dataclass(frozen=True)
@@ -175,11 +166,6 @@ class RayFalloff(GaussianFalloff):
     @property
     @override
     def num_geometry(self) -> int:
-        return 9
-
-    @property
-    @override
-    def num_moments(self) -> int:
         return 9
 
     @override
@@ -261,9 +247,8 @@ class RayFalloff(GaussianFalloff):
         log2_opacity = dr.select(active, self.log2_opacity(geometry), -dr.inf)
         assert self.camera is not None, "bound by for_camera"
         from_anchor = offsets_from(*closest_on_film(self.camera, *geometry[:2]))
-        pixels = zip(*map(flat_columns, (affine.u, affine.v, *from_anchor)), strict=True)
         along, exponent, log2_alpha = [], [], []
-        for u, v, x, y in pixels:
+        for u, v, x, y in zip(affine.u, affine.v, *from_anchor, strict=True):
             squared, a, denominator = ray_denominator(geometry, u, v, x, y)
             # Elsewhere alpha is 0, and its derivatives' factors have to be finite.
             shows = (a > 0) & (squared < MAX_EXPONENT * denominator)
@@ -271,16 +256,8 @@ class RayFalloff(GaussianFalloff):
             along.append(a * inverse)
             exponent.append(squared * inverse)
             log2_alpha.append(dr.select(shows, log2_opacity - exponent[-1], -dr.inf))
-        return RayFootprint(
-            dx=affine.dx,
-            dy=affine.dy,
-            u=affine.u,
-            v=affine.v,
-            log2_alpha=log2_alpha,
-            along=along,
-            exponent=exponent,
-            from_anchor=from_anchor,
-        )
+        grids = affine.dx, affine.dy, affine.u, affine.v
+        return RayFootprint(*grids, log2_alpha, along, exponent, from_anchor)
 
     @override
     def moments(
@@ -296,9 +273,8 @@ class RayFalloff(GaussianFalloff):
         dx, dy = footprint.dx, footprint.dy
         anchor_x, anchor_y = footprint.from_anchor
         x, y, z, bb = [], [], [], []
-        for w, a, b, (u, v) in zip(
-            weights, footprint.along, footprint.exponent, footprint.coordinates, strict=True
-        ):
+        pixels = weights, footprint.along, footprint.exponent, footprint.u, footprint.v
+        for w, a, b, u, v in zip(*pixels, strict=True):
             w_a, w_b = w * a, w * b
             x.append(w_a * a * u)
             y.append(w_a * a * v)
@@ -351,15 +327,11 @@ class RayFalloff(GaussianFalloff):
         d_x, d_y, d_p, d_r, d_s, d_log_opacity, d_gx, d_gy, d_h = d_geometry
         d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
         d_h = d_h / WHITENING_SCALE**2
-        pixels = zip(
-            *map(flat_columns, (footprint.dx, footprint.dy, footprint.u, footprint.v)),
-            *map(flat_columns, footprint.from_anchor),
-            footprint.along,
-            footprint.exponent,
-            strict=True,
-        )
+        pixels = footprint.dx, footprint.dy, footprint.u, footprint.v, *footprint.from_anchor
         result = []
-        for dx, dy, u, v, x, y, a, b in pixels:
+        for dx, dy, u, v, x, y, a, b in zip(
+            *pixels, footprint.along, footprint.exponent, strict=True
+        ):
             d_u = dr.fma(d_p, dx, dr.fma(d_r, dy, -dr.fma(p, d_x, r * d_y)))
             d_v = dr.fma(d_s, dy, -s * d_y)
             d_a = dr.fma(d_gx, x, d_gy * y)
@@ -390,3 +362,121 @@ def ray_denominator(
 def _sign(p: Float) -> Float:
     """Return the sign of a_c, which is that of U."""
     return type(p)(dr.copysign(type(p)(1), p))
+
+
+@dataclass(frozen=True)
+class AffineDepths:
+    """Depths at a pixel from kappa and h, for falloffs that compute none; the base class."""
+
+    bounds: tuple[Float, Float] | None = None  # nearest and farthest, (H * W,), scene units
+    bound: list[tuple[Float, Float]] = field(default_factory=list)  # the same, at the 16 of a lane
+
+    def for_camera(self, camera: Camera) -> AffineDepths:
+        """Return the depths for one camera, which may have parallel rays."""
+        return ParallelDepths(self.bounds) if camera.lens.parallel else self
+
+    def keys(self, splats: Splats2D) -> list[Float]:
+        """Return columns from which depths are computed: kappa, h (to base 2); last, their unit."""
+        ray, scale = splats.ray, WHITENING_SCALE
+        assert ray is not None, "as the projection makes them"
+        return [ray.tilt_x / scale, ray.tilt_y / scale, ray.spread / scale**2, splats.depths]
+
+    def depth_ratio(
+        self, falloff: GaussianFalloff, geometry: list[Float], keys: list[Float], x: Float, y: Float
+    ) -> tuple[Float, Float]:
+        """Return a and D at a point of the film, px: the depth is a / D in the unit, if a > 0."""
+        return self._depth_ratio(keys, *falloff.coordinates(geometry, x, y))
+
+    def bind(self, lanes: Lanes, grid: TileGrid) -> AffineDepths:
+        """Load the bounds, if there are any, for the lanes of one kernel."""
+        if self.bounds is None:
+            return self
+        near, far = (load_pixels(bound, lanes, grid) for bound in self.bounds)
+        return replace(self, bound=list(zip(near, far, strict=True)))
+
+    def pixel_depths(self, footprint: MicroTileFootprint, keys: list[Float]) -> list[Float]:
+        """Return depths in the unit at the 16 pixels; not positive where there is none."""
+        found, unit = self._pixel_depths(footprint, keys), keys[-1]
+        if not self.bound:
+            return found
+        return [
+            dr.select((unit * along > near) & (unit * along < far), along, -1)
+            for along, (near, far) in zip(found, self.bound, strict=True)
+        ]
+
+    def _pixel_depths(self, footprint: MicroTileFootprint, keys: list[Float]) -> list[Float]:
+        coordinates = zip(footprint.u, footprint.v, strict=True)
+        return [
+            a / denominator for a, denominator in (self._depth_ratio(keys, *e) for e in coordinates)
+        ]
+
+    @staticmethod
+    def _depth_ratio(keys: list[Float], u: Float, v: Float) -> tuple[Float, Float]:
+        kx, ky, h = keys[:3]
+        a = dr.fma(-kx, u, dr.fma(-ky, v, 1))
+        return a, dr.fma(a, a, h * dr.fma(u, u, v * v))
+
+
+@dataclass(frozen=True)
+class WithAffineDepth:
+    """A projection with the input of :class:`AffineDepths`: the affine covariance with depth."""
+
+    shape: FilmProjection
+
+    def __call__(
+        self, rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
+    ) -> FilmShape:
+        """Project; h is not negative. Where slopes are clamped, the splat is the affine one."""
+        film = self.shape(rows, camera, position, low_pass)
+        slopes = camera.lens.clamped_slopes(camera, position)
+        m0, m1, n = film_axes(rows, camera, position, slopes)
+        p, r, s = film.conic_factor
+        kx, ky = dr.dot(m0, n), dr.dot(m1, n)
+        kx, ky = dr.fma(p, kx, r * ky), s * ky
+        h = dr.squared_norm(n) - dr.fma(kx, kx, ky * ky)
+        return replace(film, ray=RayTerms(kx, ky, dr.select(h > 0, h, 0)))
+
+
+@dataclass(frozen=True)
+class ParallelDepths(AffineDepths):
+    """Depths at a pixel for parallel rays."""
+
+    @staticmethod
+    @override
+    def _depth_ratio(keys: list[Float], u: Float, v: Float) -> tuple[Float, Float]:
+        kx, ky = keys[:2]
+        return dr.fma(kx, u, dr.fma(ky, v, 1)), type(u)(1)
+
+
+@dataclass(frozen=True)
+class RayDepths(AffineDepths):
+    """Depths at a pixel by ``RayFalloff``."""
+
+    camera: Camera | None = None
+
+    @override
+    def for_camera(self, camera: Camera) -> RayDepths:
+        return replace(self, camera=camera)
+
+    @override
+    def keys(self, splats: Splats2D) -> list[Float]:
+        ray = splats.ray
+        assert ray is not None and ray.scale is not None, "as exact_shape makes them"
+        return [splats.depths * ray.scale]
+
+    @override
+    def depth_ratio(
+        self, falloff: GaussianFalloff, geometry: list[Float], keys: list[Float], x: Float, y: Float
+    ) -> tuple[Float, Float]:
+        del keys
+        u, v = falloff.coordinates(geometry, x, y)
+        assert self.camera is not None, "bound by for_camera"
+        anchor = closest_on_film(self.camera, *geometry[:2])
+        _, a, denominator = ray_denominator(geometry, u, v, x - anchor.x, y - anchor.y)
+        return a, denominator
+
+    @override
+    def _pixel_depths(self, footprint: MicroTileFootprint, keys: list[Float]) -> list[Float]:
+        del keys
+        assert isinstance(footprint, RayFootprint), "made by RayFalloff"
+        return footprint.along

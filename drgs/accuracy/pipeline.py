@@ -6,12 +6,8 @@ from dataclasses import replace
 
 from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
 from drgs.core.errors import UnsupportedError
-from drgs.splatting.footprint import DEFAULT, Cutoffs, GaussianFalloff, ImageModel
-from drgs.splatting.projection import (
-    color_at_mean,
-    compensated_opacity,
-    plain_opacity,
-)
+from drgs.splatting.footprint import Cutoffs, ImageModel
+from drgs.splatting.projection import color_at_mean, compensated_opacity, plain_opacity
 from drgs.splatting.rendering import Feature, Pipeline, color_features
 
 MIN_STOP = 1e-30  # stop where none is set: past it float32 has no transmittance to go back from
@@ -27,14 +23,16 @@ def pipeline_of(
     cutoffs = Cutoffs(
         approximations.alpha_max, approximations.alpha_cut, stop, approximations.extent
     )
-    model = DEFAULT if cutoffs == Cutoffs() else ImageModel(cutoffs=cutoffs)
     projection = PROJECTIONS.get(approximations.projection).value
     falloff = FALLOFFS.get(approximations.falloff).value
     if projection.falloff is not None:
-        _check_no_falloff(approximations)
+        if approximations.falloff != FALLOFFS.shipped_names[0]:
+            raise UnsupportedError(
+                f"splats: projection '{approximations.projection}' has a falloff of its own, got "
+                f"falloff '{approximations.falloff}'; use another projection, or no falloff"
+            )
         falloff = projection.falloff
-    if falloff is not GaussianFalloff:
-        model = replace(model, falloff=falloff())
+    model = ImageModel(falloff=falloff(), cutoffs=cutoffs)
     shape, order = ORDERS.get(approximations.order).value.create(projection, approximations)
     color = color_at_mean
     if approximations.sh_direction == "pixel":
@@ -51,11 +49,3 @@ def pipeline_of(
         model=model,
         order=order,
     )
-
-
-def _check_no_falloff(approximations: Approximations) -> None:
-    if approximations.falloff != FALLOFFS.shipped_names[0]:
-        raise UnsupportedError(
-            f"splats: projection '{approximations.projection}' has a falloff of its own, got "
-            f"falloff '{approximations.falloff}'; use another projection, or no falloff"
-        )

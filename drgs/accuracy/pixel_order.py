@@ -24,20 +24,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import drjit as dr
 from typing_extensions import override
 
-from drgs.accuracy.exact import RayFalloff, ewa_with_depth
-from drgs.accuracy.pixel_lists import AffineDepths, PixelLists, RayDepths, WithAffineDepth
+from drgs.accuracy.exact import (
+    AffineDepths,
+    RayDepths,
+    RayFalloff,
+    WithAffineDepth,
+    ewa_with_depth,
+)
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
-from drgs.core.arrays import Rows, scatter_rows, types_of
+from drgs.core.arrays import Rows, reinterpret, scatter_rows, types_of
 from drgs.core.types import Bool, Float, UInt32
-from drgs.splatting.footprint import Alpha, ImageModel, MicroTileFootprint, flat_columns
+from drgs.splatting.footprint import Alpha, ImageModel, MicroTileFootprint
 from drgs.splatting.grid import (
+    GRID,
+    MICRO,
+    MICROS,
     PIXELS,
+    TILE,
     Lanes,
     group_by_work,
     load_lane_row,
@@ -58,7 +67,7 @@ from drgs.splatting.rasterize import (
     splat_gradients,
 )
 from drgs.splatting.reduction import sum_runs
-from drgs.splatting.tiles import TileBins
+from drgs.splatting.tiles import TileBins, lower_bounds, stable_order
 
 S = TypeVar("S")
 
@@ -100,7 +109,39 @@ class PixelOrder(CenterOrder):
 
     @override
     def composite(self, bins: TileBins, records: Records) -> _OrderedTiles:
-        return _composite(bins, records, self)
+        t = types_of(bins.rows.Float)
+        lists = PixelLists.build(bins, records, self.depths)
+        inputs = _WalkInputs.from_lists(bins, records, lists, self)
+        lanes, model, size = inputs.lanes, inputs.model, inputs.size
+        count = model.features.num_planes(bins.num_features)
+
+        def visit(state: tuple, visited: list[list[Float]]) -> tuple:
+            T, C = list(state[0]), [list(plane) for plane in state[1]]
+            for pixel, (alpha, *features) in enumerate(visited):
+                weight, T[pixel], _ = composite_step(T[pixel], alpha, inputs.stop)
+                for k, c in enumerate(features):
+                    C[k][pixel] = dr.fma(weight, c, C[k][pixel])
+            return (T, C), any_unfinished(T)
+
+        T, C = _walk(
+            inputs,
+            carry=lambda met, pixel: model.features.pixel_values(met.features, pixel),
+            visit=visit,
+            state=(inputs.transmittance(), inputs.zeros(count)),
+            nothing=[dr.zeros(t.Float, size)] * count,
+        )
+        dr.eval(T, C)
+        columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
+        last = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
+        return _OrderedTiles(
+            bins=bins,
+            records=records,
+            values=scatter_rows(columns, lanes.micro_tile, size),
+            ends=scatter_rows([last] * PIXELS, lanes.micro_tile, size),
+            stop=scatter_rows([last], lanes.micro_tile, size),
+            count=count,
+            lists=lists,
+        )
 
     @override
     def adjoint(
@@ -111,16 +152,173 @@ class PixelOrder(CenterOrder):
         before: SplatGradients | None = None,
     ) -> SplatGradients:
         inputs = _WalkInputs.from_tiles(tiles, self, samples)
-        return _adjoint(inputs, tiles, d_planes, before)
+        d_transmittance, *d_features = d_planes
+        g = [load_pixels(plane, inputs.lanes, inputs.bins.grid) for plane in d_features]
+        pairs = _pairs(inputs, _totals(inputs, tiles, g, d_transmittance), g)
+        return _sum_items(inputs, _sum_pixels(inputs, pairs, g), before)
 
     @override
     def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
-        return _tangent(_WalkInputs.from_tiles(tiles, self), tiles, tangents)
+        inputs = _WalkInputs.from_tiles(tiles, self)
+        bins, model, size = inputs.bins, inputs.model, inputs.size
+        d_records, count = pack_tangents(bins, tangents), tiles.count
+
+        def carry(met: _Crossing, pixel: int) -> list[Float]:
+            d_geometry, d_features = d_records.load(met.entry, met.active)
+            d_log_alpha = model.falloff.tangent(met.geometry, met.footprint, d_geometry)[pixel]
+            alpha = met.alphas[pixel]
+            return [
+                dr.select(alpha.smooth, alpha.value * d_log_alpha, 0),
+                *model.features.pixel_values(met.features, pixel),
+                *model.features.tangents(met.features, d_features, pixel),
+            ]
+
+        def visit(state: tuple, visited: list[list[Float]]) -> tuple:
+            T, dT = list(state[0]), list(state[1])
+            dC = [list(plane) for plane in state[2]]
+            for pixel, (alpha, d_alpha, *features) in enumerate(visited):
+                # Behind the camera, there is a footprint.
+                d_alpha = dr.select(alpha > 0, d_alpha, 0)
+                before, d_before = dr.abs(T[pixel]), dT[pixel]
+                weight, T[pixel], goes_on = composite_step(T[pixel], alpha, inputs.stop)
+                d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha * d_before), 0)
+                dT[pixel] = d_before - d_weight
+                for k in range(count):
+                    change = dr.fma(d_weight, features[k], weight * features[count + k])
+                    dC[k][pixel] = dC[k][pixel] + change
+            return (T, dT, dC), any_unfinished(T)
+
+        _, dT, dC = _walk(
+            inputs,
+            carry=carry,
+            visit=visit,
+            state=(inputs.transmittance(), inputs.zeros(1)[0], inputs.zeros(count)),
+            nothing=[dr.zeros(bins.rows.Float, size)] * (1 + 2 * count),
+        )
+        columns = dT + [v for plane in dC for v in plane]
+        dr.eval(columns)
+        return tiles.unpack(scatter_rows(columns, inputs.lanes.micro_tile, size))
 
 
-# ----------------------------------------------------------------------------------------------
-# The walk
-# ----------------------------------------------------------------------------------------------
+MAX_DEPTH_RATIO = 4.0
+"""Sort keys of lists, relative to the mean's depth, are clamped to this and its inverse."""
+
+
+@dataclass(frozen=True)
+class PixelLists:
+    """Sorted entries of each micro-tile, front to back. An *item* is a pair of the two."""
+
+    entries: UInt32  # (items,): place in the lists -> sorted entry
+    order: UInt32  # (items,): place in the lists -> item as made
+    first_item: UInt32  # (N + 1,): rank -> first of its items as made
+    start: UInt32  # (tiles * 16 + 1,): micro-tile -> first place
+    count: int  # items
+
+    def range(self, lanes: Lanes) -> tuple[UInt32, UInt32]:
+        """Return the first place, and one behind the last, of each lane."""
+        UInt32, number = type(self.start), lanes.tile * MICROS + lanes.micro
+        first = dr.gather(UInt32, self.start, number)
+        return first, dr.gather(UInt32, self.start, number + 1)
+
+    def places(self) -> UInt32:
+        """Return the map from an item as made to its place in the lists, (items,)."""
+        UInt32, size = type(self.order), dr.width(self.order)
+        places = dr.empty(UInt32, size)
+        dr.scatter(places, dr.arange(UInt32, size), self.order)
+        return places
+
+    @staticmethod
+    def build(bins: TileBins, records: Records, depths: AffineDepths) -> PixelLists:
+        """Make the lists. The host reads one value, the number of items."""
+        t = types_of(bins.rows.Float)
+        # Unsorted entries, and one behind the last.
+        position = dr.arange(t.UInt32, bins.num_entries)
+        entry = dr.zeros(t.UInt32, bins.num_entries + 1)
+        dr.scatter(entry, position, dr.gather(t.UInt32, bins.source, position))
+        dr.eval(entry)
+        exists = dr.arange(t.UInt32, bins.num_entries + 1) < dr.opaque(t.UInt32, bins.num_entries)
+        masks = dr.gather(t.UInt32, bins.masks, entry, exists)
+        first = dr.prefix_sum(dr.popcnt(masks))
+        count = int(first[bins.num_entries])
+
+        at, micro_tiles, entries = _items(bins, records, depths, entry, masks, first, max(count, 1))
+        by_depth = stable_order(_levels(at), _LEVELS)
+        lists = dr.gather(t.UInt32, micro_tiles, by_depth)
+        num_lists = bins.grid.num_tiles * MICROS
+        order = dr.gather(t.UInt32, by_depth, stable_order(lists, num_lists))
+        entries, lists = (dr.gather(t.UInt32, c, order) for c in (entries, micro_tiles))
+        dr.eval(entries, lists, order)
+        return PixelLists(
+            entries=entries,
+            order=order,
+            first_item=dr.gather(t.UInt32, first, bins.first_entry),
+            start=lower_bounds(lists, count, num_lists),
+            count=count,
+        )
+
+
+_LEVELS = 1 << 14
+"""Number of distinct depths in lists, limited by one pass of a sort. Splats of equal level are in
+the order of their means, and the window sorts them."""
+
+
+def _levels(depths: Float) -> UInt32:
+    """Quantize positive depths to ``_LEVELS`` parts of their range; nearly logarithmic."""
+    # Bits of positive single-precision numbers have the order of the numbers.
+    Single = cast(type[Float], dr.float32_array_t(type(depths)))
+    bits = reinterpret(types_of(Single).UInt32, Single(depths))
+    first = dr.min(bits)
+    scale = (_LEVELS - 1) / Single(dr.max(bits) - first + 1)
+    level = type(bits)(Single(bits - first) * scale)
+    return dr.select(level < _LEVELS, level, _LEVELS - 1)
+
+
+def _items(
+    bins: TileBins,
+    records: Records,
+    depths: AffineDepths,
+    entry: UInt32,
+    masks: UInt32,
+    item: UInt32,
+    count: int,
+) -> tuple[Float, UInt32, UInt32]:
+    """Return items: the depths of peaks at the centre of micro-tiles, micro-tiles, and entries.
+
+    entry: sorted entries; masks: their micro-tiles; item: the first of each one's items.
+    """
+    t = types_of(bins.rows.Float)
+    # A single item that is not made, if there are none.
+    items = dr.ones(t.Float, count), dr.zeros(t.UInt32, count), dr.zeros(t.UInt32, count)
+    dr.eval(items)
+    exists = masks != 0
+    geometry, _ = records.load(entry, exists)
+    keys = records.load_keys(entry, exists)
+    tile = dr.gather(t.UInt32, bins.tiles, entry, exists)
+    columns = dr.opaque(t.UInt32, bins.grid.columns)
+    row = tile // columns
+    # Middle of the first micro-tile.
+    x = t.Float((tile - row * columns) * TILE) + MICRO / 2
+    y = t.Float(row * TILE) + MICRO / 2
+
+    def body(masks: UInt32, item: UInt32) -> tuple:
+        micro = dr.tzcnt(masks)
+        middle = x + t.Float(micro % GRID) * MICRO, y + t.Float(micro // GRID) * MICRO
+        middle = bins.model.nearest(middle[0], geometry[0]), middle[1]
+        a, denominator = depths.depth_ratio(bins.model.falloff, geometry, keys, *middle)
+        # Without a peak here, a neighbouring pixel may have one.
+        along = dr.select(a > 0, a / denominator, 1)
+        along = dr.select(along < 1 / MAX_DEPTH_RATIO, 1 / MAX_DEPTH_RATIO, along)
+        along = dr.select(along > MAX_DEPTH_RATIO, MAX_DEPTH_RATIO, along)
+        values = keys[-1] * along, tile * MICROS + micro, entry
+        for column, value in zip(items, values, strict=True):
+            dr.scatter(column, value, item)
+        return masks & (masks - 1), item + 1
+
+    loop = dr.while_loop(
+        state=(t.UInt32(masks), t.UInt32(item)), cond=lambda masks, item: masks != 0, body=body
+    )
+    dr.eval(loop, items)
+    return items
 
 
 @dataclass(frozen=True)
@@ -274,70 +472,11 @@ def _insert(places: list[list[Float]], item: list[Float]) -> tuple[list[list[Flo
     return places, item
 
 
-# ----------------------------------------------------------------------------------------------
-# Forward
-# ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _OrderedTiles(CompositedTiles):
     """Composited tiles with the lists, which the adjoint and the tangent use again."""
 
     lists: PixelLists
-
-
-def _composite(bins: TileBins, records: Records, order: PixelOrder) -> _OrderedTiles:
-    t = types_of(bins.rows.Float)
-    lists = PixelLists.build(bins, records, order.depths)
-    inputs = _WalkInputs.from_lists(bins, records, lists, order)
-    lanes, model, size = inputs.lanes, inputs.model, inputs.size
-    count = model.features.num_planes(bins.num_features)
-
-    def visit(state: tuple, visited: list[list[Float]]) -> tuple:
-        T, C = list(state[0]), [list(plane) for plane in state[1]]
-        for pixel, (alpha, *features) in enumerate(visited):
-            weight, T[pixel], _ = composite_step(T[pixel], alpha, inputs.stop)
-            for k, c in enumerate(features):
-                C[k][pixel] = dr.fma(weight, c, C[k][pixel])
-        return (T, C), any_unfinished(T)
-
-    T, C = _walk(
-        inputs,
-        carry=lambda met, pixel: model.features.pixel_values(met.features, pixel),
-        visit=visit,
-        state=(inputs.transmittance(), inputs.zeros(count)),
-        nothing=[dr.zeros(t.Float, size)] * count,
-    )
-    dr.eval(T, C)
-    columns = [dr.abs(v) for v in T] + flat_columns(C)
-    last = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
-    return _OrderedTiles(
-        bins=bins,
-        records=records,
-        values=scatter_rows(columns, lanes.micro_tile, size),
-        ends=scatter_rows([last] * PIXELS, lanes.micro_tile, size),
-        stop=scatter_rows([last], lanes.micro_tile, size),
-        count=count,
-        lists=lists,
-    )
-
-
-# ----------------------------------------------------------------------------------------------
-# Adjoint
-# ----------------------------------------------------------------------------------------------
-
-
-def _adjoint(
-    inputs: _WalkInputs,
-    tiles: CompositedTiles,
-    d_planes: Sequence[Float],
-    before: SplatGradients | None,
-) -> SplatGradients:
-    d_transmittance, *d_features = d_planes
-    g = [load_pixels(plane, inputs.lanes, inputs.bins.grid) for plane in d_features]
-    totals = _totals(inputs, tiles, g, d_transmittance)
-    pairs = _pairs(inputs, totals, g)
-    return _sum_items(inputs, _sum_pixels(inputs, pairs, g), before)
 
 
 def _feature_gradient(
@@ -469,48 +608,3 @@ def _add_product(high: Float, low: Float, a: Float, b: Float) -> tuple[Float, Fl
     part = total - high
     lost = (high - (total - part)) + (product - part)
     return total, low + (lost + rest)
-
-
-# ----------------------------------------------------------------------------------------------
-# Tangent
-# ----------------------------------------------------------------------------------------------
-
-
-def _tangent(inputs: _WalkInputs, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:
-    bins, model, size = inputs.bins, inputs.model, inputs.size
-    d_records, count = pack_tangents(bins, tangents), tiles.count
-
-    def carry(met: _Crossing, pixel: int) -> list[Float]:
-        d_geometry, d_features = d_records.load(met.entry, met.active)
-        d_log_alpha = model.falloff.tangent(met.geometry, met.footprint, d_geometry)[pixel]
-        alpha = met.alphas[pixel]
-        return [
-            dr.select(alpha.smooth, alpha.value * d_log_alpha, 0),
-            *model.features.pixel_values(met.features, pixel),
-            *model.features.tangents(met.features, d_features, pixel),
-        ]
-
-    def visit(state: tuple, visited: list[list[Float]]) -> tuple:
-        T, dT = list(state[0]), list(state[1])
-        dC = [list(plane) for plane in state[2]]
-        for pixel, (alpha, d_alpha, *features) in enumerate(visited):
-            d_alpha = dr.select(alpha > 0, d_alpha, 0)  # behind the camera, there is a footprint
-            before, d_before = dr.abs(T[pixel]), dT[pixel]
-            weight, T[pixel], goes_on = composite_step(T[pixel], alpha, inputs.stop)
-            d_weight = dr.select(goes_on, dr.fma(before, d_alpha, alpha * d_before), 0)
-            dT[pixel] = d_before - d_weight
-            for k in range(count):
-                change = dr.fma(d_weight, features[k], weight * features[count + k])
-                dC[k][pixel] = dC[k][pixel] + change
-        return (T, dT, dC), any_unfinished(T)
-
-    _, dT, dC = _walk(
-        inputs,
-        carry=carry,
-        visit=visit,
-        state=(inputs.transmittance(), inputs.zeros(1)[0], inputs.zeros(count)),
-        nothing=[dr.zeros(bins.rows.Float, size)] * (1 + 2 * count),
-    )
-    columns = dT + flat_columns(dC)
-    dr.eval(columns)
-    return tiles.unpack(scatter_rows(columns, inputs.lanes.micro_tile, size))

@@ -81,8 +81,9 @@ class RayColors(SplatFeatures):
         ]
         return colors + stored[self.num_coefficients :]
 
-    def _sums(self, stored: list[Float], pixel: int) -> list[Float]:
-        sums = [type(stored[0])(0.5)] * CHANNELS
+    def _sums(self, stored: list[Float], pixel: int, start: float = 0.5) -> list[Float]:
+        """Return sums of basis functions times coefficients."""
+        sums = [type(stored[0])(start)] * CHANNELS
         for k, basis in enumerate(self.basis[pixel]):
             coefficients = stored[CHANNELS * k : CHANNELS * (k + 1)]
             sums = [dr.fma(c, basis, total) for c, total in zip(coefficients, sums, strict=True)]
@@ -107,14 +108,8 @@ class RayColors(SplatFeatures):
 
     @override
     def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:
-        d_colors = [type(d_stored[0])(0)] * CHANNELS
-        for k, basis in enumerate(self.basis[pixel]):
-            d = d_stored[CHANNELS * k : CHANNELS * (k + 1)]
-            d_colors = [dr.fma(c, basis, total) for c, total in zip(d, d_colors, strict=True)]
-        d_colors = [
-            dr.select(value < COLOR_MIN, 0, d)
-            for value, d in zip(self._sums(stored, pixel), d_colors, strict=True)
-        ]
+        pairs = zip(self._sums(stored, pixel), self._sums(d_stored, pixel, 0), strict=True)
+        d_colors = [dr.select(value < COLOR_MIN, 0, d) for value, d in pairs]
         return d_colors + d_stored[self.num_coefficients :]
 
 

@@ -101,9 +101,8 @@ def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Array3f) -> _
     """Project the sigma points through a pinhole, by formulas that do not cancel."""
     slopes = lens.true_slopes(camera, position)
     m0, m1, n = film_axes(rows, camera, position, slopes)
-    far_enough = (
-        dr.max(dr.abs(n)) <= (1 - MIN_RELATIVE_DEPTH) / SIGMA_POINT_STDS
-    )  # no point is too near
+    # No point is too near.
+    far_enough = dr.max(dr.abs(n)) <= (1 - MIN_RELATIVE_DEPTH) / SIGMA_POINT_STDS
     return _SigmaPoints(
         offsets=[_sigma_offsets(m, n) for m in (m0, m1)],
         mean=[_mean_offset(m, n) for m in (m0, m1)],

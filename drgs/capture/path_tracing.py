@@ -28,7 +28,7 @@ from drgs.cameras.axes import OPENGL_TO_MITSUBA
 from drgs.core.errors import UserError, one_line, reason_of_mitsuba
 from drgs.core.types import Bool
 from drgs.integrator.scene import film_description
-from drgs.integrator.types import is_splats
+from drgs.integrator.state import is_splats
 from drgs.io.images import to_uint8
 from drgs.io.scenes import load_scene_dictionary, load_scene_file
 

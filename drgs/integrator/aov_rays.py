@@ -48,17 +48,14 @@ class ImageRays:
         film = sensor.film()
         width, height = film.crop_size()
         count, rest = divmod(dr.width(ray), width * height)
-        if count == 0 or rest or is_batch(sensor):
-            raise UnsupportedError(_unknown_sensor_message(sensor))
+        _require(count > 0 and rest == 0 and not is_batch(sensor), sensor)
         camera = camera_from_sensor(read_sensor(sensor, near))
-        if camera.shutter is not None:
-            raise UnsupportedError(_unknown_sensor_message(sensor))
+        _require(camera.shutter is None, sensor)
         corner = dr.repeat(pixel_corners(film), count)
         place, on_camera = _look_back(camera, ray)
         within = place - corner
         inside = (dr.min(within) > -PIXEL_MARGIN_PX) & (dr.max(within) < 1 + PIXEL_MARGIN_PX)
-        if not dr.all(inside & on_camera):
-            raise UnsupportedError(_unknown_sensor_message(sensor))
+        _require(bool(dr.all(inside & on_camera)), sensor)
         within = mi.Point2f(dr.clip(within, 0, 1 - dr.epsilon(mi.Float)))
         positions = split_passes(within, count, width * height)
         dr.eval([(p.x, p.y) for p in positions])
@@ -121,9 +118,10 @@ def _look_back(camera: Camera, ray: mi.Ray3f) -> tuple[mi.Point2f, mi.Bool]:
     return mi.Point2f(place), near & (dr.dot(axis, direction) > 0) & seen
 
 
-def _unknown_sensor_message(sensor: mi.Sensor) -> str:
-    return (
-        "splats: inside 'aov', rays must be those of the whole film, without sample_border, of a "
-        "sensor of type perspective, thinlens, orthographic or calibrated that stands still; "
-        f"those of {sensor.class_name()} '{sensor.id()}' are not"
-    )
+def _require(holds: bool, sensor: mi.Sensor) -> None:
+    if not holds:
+        raise UnsupportedError(
+            "splats: inside 'aov', rays must be those of the whole film, without sample_border, of "
+            "a sensor of type perspective, thinlens, orthographic or calibrated that stands still; "
+            f"those of {sensor.class_name()} '{sensor.id()}' are not"
+        )

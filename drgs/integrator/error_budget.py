@@ -50,7 +50,7 @@ def meet_error_budget(
     """
     alone = [one for sensor in sensors for one in sensors_of(sensor)]
     cameras = [
-        without_effects(camera_from_sensor(read_sensor(one, splats.near).detach()), splats.ignore)
+        without_effects(camera_from_sensor(read_sensor(one, splats.near)), splats.ignore)
         for one in alone
     ]
     background = (0.0, 0.0, 0.0)

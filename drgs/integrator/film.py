@@ -1,10 +1,13 @@
-"""Samples of a film: sample positions, and the image from the values there.
+"""Samples of a film: sample positions, backgrounds, and the image from the values there.
 
 :class:`CenterSamples` evaluates each pixel once, at its centre; :class:`DrawnSamples` at several
 points of Mitsuba's samplers, in passes of one point per pixel or, on a small film, of several
 (:class:`SamplePoints`). A box filter averages the samples in their order: the same bytes in every
 run. Any other filter adds a sample to neighbours atomically: runs agree only up to rounding. No
 samples are taken beyond the film, also where it has ``sample_border``.
+
+Backgrounds that differ from pixel to pixel are environments, and textures stretched over the film.
+Derivatives of their texels are added atomically as well.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 from typing_extensions import override
 
+from drgs.cameras.camera import Camera
 from drgs.core.arrays import divide, from_host, interleave, quotient, repeat_array, types_of
 from drgs.core.errors import UnsupportedError
 from drgs.core.types import Float
@@ -49,11 +53,6 @@ def pixel_corners(film: mi.Film, samples: int = 1) -> mi.Point2f:
 def num_samples(film: mi.Film, x: Float | float) -> int:
     """Return the samples per pixel of a plane; x may be one number for all pixels."""
     return max(dr.width(x) // dr.prod(film.crop_size()), 1)
-
-
-def sample_offsets(positions: SamplePositions) -> tuple[Float | float, Float | float]:
-    """Return x and y of sample positions from their pixels' upper left corners, px."""
-    return (positions.x, positions.y) if isinstance(positions, SamplePoints) else (0.5, 0.5)
 
 
 def decode(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
@@ -274,13 +273,49 @@ class LanePoints(SamplePositions):
         ]
 
     @override
-    def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
+    def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list[Float], list[Float]]:
         Float = types_of(type(x)).Float
         first_x, first_y = Float(lanes.x) - x, Float(lanes.y) - y
         dx = [first_x + (pixel % MICRO) + in_x for pixel, in_x in enumerate(self.x)]
         dy = [first_y + (pixel // MICRO) + in_y for pixel, in_y in enumerate(self.y)]
-        return _grid(dx), _grid(dy)
+        return dx, dy
 
 
-def _grid(values: list[Float]) -> list[list[Float]]:
-    return [values[MICRO * j : MICRO * j + MICRO] for j in range(MICRO)]
+LENS_POINTS = 16  # fixed points of an aperture; a small, bright light is seen as this many
+
+
+def environment_radiance(emitter: mi.Emitter, camera: Camera, place: mi.Point2f) -> mi.Color3f:
+    """Return an environment at places of the crop window, px; black where the lens ends."""
+    ray, seen, count = camera.view_directions(place.x, place.y, LENS_POINTS)
+    interaction = dr.zeros(mi.SurfaceInteraction3f, count * dr.width(place))
+    interaction.wi = -mi.Vector3f(dr.normalize(ray))  # the environment is infinitely far
+    radiance = mi.Color3f(emitter.eval(interaction))
+    if seen is not True:
+        radiance = dr.select(seen, radiance, 0)
+    if count == 1 or dr.width(radiance) == 1:  # the latter: a constant environment
+        return radiance
+    return mi.Color3f([dr.block_sum(color, count) for color in radiance]) / count
+
+
+def stretched_radiance(texture: mi.Texture, film: mi.Film, place: mi.Point2f) -> mi.Color3f:
+    """Return a texture that is stretched over the film; place: on the crop window, px."""
+    interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(place))
+    interaction.uv = (place + mi.Vector2f(film.crop_offset())) / mi.Vector2f(film.size())
+    return mi.Color3f(texture.eval(interaction))
+
+
+def background_radiance(
+    film: mi.Film,
+    background: mi.Emitter | mi.Texture,
+    cameras: Sequence[Camera],
+    offsets: Sequence[tuple[mi.Float | float, mi.Float | float]],
+) -> list[list[mi.Color3f]]:
+    """Return the background at all pixels, by time and by pass.
+
+    cameras: by time; offsets: by pass, x and y from the pixel's upper left corner, px.
+    """
+    places = [pixel_corners(film, num_samples(film, x)) + mi.Vector2f(x, y) for x, y in offsets]
+    if isinstance(background, mi.Texture):
+        found = [stretched_radiance(background, film, place) for place in places]
+        return [found] * len(cameras)
+    return [[environment_radiance(background, camera, p) for p in places] for camera in cameras]

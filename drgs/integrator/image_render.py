@@ -24,9 +24,17 @@ from drgs.core.memory import MAX_LANES, UNCHECKED_BYTES, available_memory, too_l
 from drgs.core.types import Float
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.film import CenterSamples, Channels, decode, sample_offsets
+from drgs.integrator.film import (
+    CenterSamples,
+    Channels,
+    DrawnSamples,
+    SamplePoints,
+    background_radiance,
+    decode,
+)
 from drgs.integrator.sensors import (
     SensorState,
+    SideBySide,
     accumulate_in_sensor,
     attached_cameras,
     camera_from_sensor,
@@ -45,7 +53,6 @@ from drgs.splatting.tiles import SplatTable
 if TYPE_CHECKING:  # imported where a scene requires them
     from drgs.integrator.light.surfaces import NestedSurfaces
     from drgs.integrator.light.visible_surfaces import SurfaceLayers
-    from drgs.integrator.sensors import SideBySide
 
 
 Passes = list[Channels]  # channels by pass: one sample per pixel or, on a small film, several
@@ -82,8 +89,6 @@ class ImageRender:
         if spp == 1 and film.rfilter().is_box_filter():
             samples = CenterSamples(film, maps, names)
         else:
-            from drgs.integrator.film import DrawnSamples
-
             samples = DrawnSamples(sensor, seed, spp, maps, names)
         whole = SensorRender(
             splats=splats,
@@ -95,26 +100,18 @@ class ImageRender:
             has_alpha=mi.has_flag(film.flags(), mi.FilmFlags.Alpha),
             nested=nested,
         )
-        if not is_batch(sensor):
-            return ImageRender([whole], samples, nested)._with_surfaces()
-        from drgs.integrator.sensors import SideBySide
-
-        batch = SideBySide.from_batch(sensor)
-        views = [
-            replace(
-                whole, index=index, sensor=one, positions=batch.positions(whole.positions, index)
-            )
-            for index, one in enumerate(batch.sensors)
-        ]
-        return ImageRender(views, samples, nested, batch)._with_surfaces()
-
-    def _with_surfaces(self) -> ImageRender:
-        if self.nested is None:
-            return self
-        count = max(view.num_surfaces(self.nested) for view in self.views)
-        nested = self.nested.with_surfaces(count)
-        self.samples.aovs += nested.compositor.channels
-        return replace(self, views=[replace(v, nested=nested) for v in self.views], nested=nested)
+        batch, views = None, [whole]
+        if is_batch(sensor):
+            batch = SideBySide.from_batch(sensor)
+            views = [
+                replace(whole, index=k, sensor=one, positions=batch.positions(whole.positions, k))
+                for k, one in enumerate(batch.sensors)
+            ]
+        if nested is not None:
+            nested = nested.with_surfaces(max(view.num_surfaces(nested) for view in views))
+            samples.aovs += nested.compositor.channels
+            views = [replace(view, nested=nested) for view in views]
+        return ImageRender(views, samples, nested, batch)
 
     def image(self) -> mi.TensorXf:
         """Return the developed image."""
@@ -386,8 +383,6 @@ class SensorRender:
         cameras = [of_time[0].camera for of_time in self.frames]
         if state.is_attached:
             cameras = self._attached_cameras(state)
-        from drgs.integrator.background import background_radiance
-
         colors = radiance = background_radiance(self.sensor.film(), behind, cameras, self._offsets)
         if environment is None or not splats.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
@@ -467,7 +462,8 @@ class SensorRender:
 
     @property
     def _offsets(self) -> list[tuple[Float | float, Float | float]]:
-        return [sample_offsets(positions) for positions in self.positions]
+        """Return x and y of each pass's samples from their pixels' upper left corners, px."""
+        return [(p.x, p.y) if isinstance(p, SamplePoints) else (0.5, 0.5) for p in self.positions]
 
     def _state(self) -> SensorState:
         return read_sensor(self.sensor, self.splats.near)

@@ -1,6 +1,6 @@
 """Gaussians of an image from several parts: splat objects and shapes.
 
-Imported when a scene has more than the unmoved Gaussians of one integrator. Each :class:`Part`
+Imported when a scene has more than the unmoved Gaussians of one integrator. Each :data:`Part`
 converts stored Gaussians to raw parameters in world space; Dr.Jit differentiates the conversions.
 Columns are gathered and interleaved as permutations, without atomic additions: derivatives are the
 same bytes in every run.
@@ -40,7 +40,7 @@ import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -65,28 +65,6 @@ ParameterColumns = dict[str, list[Float]]  # columns of parameters by name
 TO_WORLD = "to_world"
 
 PER_DEGREE = {num_coefficients(degree): degree for degree in range(4)}
-
-
-class Part(Protocol):
-    """Stored Gaussians and their conversion to raw parameters in world space."""
-
-    @property
-    def values(self) -> ParameterArrays:
-        """Stored arrays by name, held so that their indices are not reused."""
-        ...
-
-    @property
-    def fixed_inputs(self) -> object:
-        """Other dependencies of the conversion, compared by ==."""
-        ...
-
-    def gaussians(self) -> Gaussians:
-        """Return the raw parameters, differentiable with respect to ``values``."""
-        ...
-
-    def detach(self) -> Part:
-        """Return the same conversion of detached values."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +242,7 @@ class ShRotation:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Gaussians of an object and its ``to_world``; see :class:`Part`."""
+    """Gaussians of an object and its ``to_world``; see :data:`Part`."""
 
     values: ParameterArrays  # of the Gaussians, and to_world
     fixed_inputs: str  # name of the parameter to_world, in messages
@@ -272,11 +250,6 @@ class Placement:
     def detach(self) -> Placement:
         """Return a detached copy."""
         return replace(self, values=dr.detach(self.values))
-
-    @staticmethod
-    def from_matrix(gaussians: Gaussians, to_world: Matrix4f, name: str) -> Placement:
-        """Place Gaussians by one matrix; name: of the parameter."""
-        return Placement({**gaussians.arrays, TO_WORLD: to_world}, name)
 
     def gaussians(self) -> Gaussians:
         """Return all parameters; PluginError where they leave float32."""
@@ -412,7 +385,7 @@ def _name(shape: mi.Shape) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Conversion:
-    """The arrays of a shape; see :class:`Part`."""
+    """The arrays of a shape; see :data:`Part`."""
 
     values: ParameterArrays  # data (10 N,), opacities (N,), sh_coeffs (3 K N,)
     fixed_inputs: ShRotation | None  # of the harmonics, not differentiated
@@ -449,6 +422,11 @@ class Conversion:
         clamped = dr.select(clamped > highest, highest, clamped)
         inside = (value >= 0) & (value <= 1) & is_visible
         return dr.select(inside, dr.replace_grad(clamped, value), clamped)
+
+
+Part = Placement | Conversion
+"""Stored Gaussians, and their conversion to raw parameters in world space: ``values`` are arrays by
+name, held so that their indices are not reused; ``fixed_inputs`` are compared by ==."""
 
 
 def conversions_of(

@@ -133,18 +133,8 @@ OBJECT_PROPERTIES = ("filename", "to_world", "smoothing", *PARAMETER_NAMES)
 """Properties of a ``splats`` that is nested in another, besides :data:`FEATURE`."""
 
 KNOWN = (
-    *(
-        "filename",
-        "to_world",
-        SHAPES_TO_WORLD,
-        "background",
-        "probes",
-        "shadows",
-        "aovs",
-        "ignore",
-        "error",
-    ),
-    *("smoothing", *SETTINGS, *LIGHT_SETTINGS, *DECLARED, *PARAMETER_NAMES),
+    *("filename", "to_world", SHAPES_TO_WORLD, "background", "probes", "shadows", "aovs"),
+    *("ignore", "error", "smoothing", *SETTINGS, *LIGHT_SETTINGS, *DECLARED, *PARAMETER_NAMES),
 )
 """Properties of ``splats``, besides nested objects and names with a prefix."""
 
@@ -237,7 +227,14 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
             )
         resolver = mi.file_resolver()  # pyright: ignore[reportCallIssue]  has no type in the stub
         path = resolver.resolve(str(props["filename"]))
-        gaussians = replace(_load_gaussians(str(path)).to(mi.TensorXf), features=features)
+        gaussians = Gaussians.load(str(path))
+        if gaussians.origin != WORLD:  # float32 requires positions relative to it
+            note = (
+                f"{path}: positions are relative to {format_origin(gaussians.origin)}; place "
+                "sensors and shapes relative to that"
+            )
+            warnings.warn(UserNote(note), stacklevel=2)
+        gaussians = replace(gaussians.to(mi.TensorXf), origin=WORLD, features=features)
     elif given or features or "to_world" in props:
         gaussians = replace(_gaussians_of_tensors(props, given), features=features)
     else:
@@ -264,18 +261,6 @@ def _gaussians_of_tensors(props: mi.Properties, given: Sequence[str]) -> Gaussia
             raise PluginError(f"splats: {name} must have the shape (N), got {tuple(shape)}")
         values[name] = mi.Float(values[name].array)
     return Gaussians(**values)
-
-
-def _load_gaussians(path: str) -> Gaussians:
-    """Return the Gaussians of a file, relative to its origin, which float32 requires."""
-    gaussians = Gaussians.load(path)
-    if gaussians.origin != WORLD:
-        note = (
-            f"{path}: positions are relative to {format_origin(gaussians.origin)}; place sensors "
-            "and shapes relative to that"
-        )
-        warnings.warn(UserNote(note), stacklevel=2)
-    return replace(gaussians, origin=WORLD)
 
 
 def _tensor(props: mi.Properties, name: str) -> mi.TensorXf:

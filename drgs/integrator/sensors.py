@@ -133,10 +133,7 @@ def camera_from_sensor(state: SensorState) -> Camera:
 
 
 def accumulate_in_sensor(cameras: Sequence[Camera], gradients: list[list[Float]]) -> None:
-    """Accumulate derivatives by ``Camera.numbers()``, by time, into the sensor of the cameras.
-
-    cameras: from :func:`attached_cameras`.
-    """
+    """Accumulate derivatives by ``Camera.numbers()``, by time; see :func:`attached_cameras`."""
     numbers = chain(*(camera.numbers() for camera in cameras))
     pairs = zip(numbers, chain(*gradients), strict=True)
     attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]

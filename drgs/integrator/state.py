@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeGuard, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +21,7 @@ from drgs.core.constants import MAX_FEATURES
 from drgs.core.errors import PluginError, UnsupportedError
 from drgs.core.private import same_variables
 from drgs.core.types import Bool, Float, TensorXf, UInt32
+from drgs.effects.compose import NamedFeature, normal_features
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting import rendering
 from drgs.splatting.rasterize import SplatGradients
@@ -85,7 +86,6 @@ class RenderCache:
     film_maps: dict[str, np.ndarray] = field(default_factory=dict)  # see drgs.integrator.film
     parts: CombinedParts | None = None  # None: the own Gaussians alone, unmoved
     has_ellipsoids: bool = False  # whether the last scene has shapes that are Gaussians
-    instances: list[mi.Shape] = field(default_factory=list)  # of the last scene, checked
     sensor: mi.Sensor | None = None  # rendered last
     surfaces: Any = None  # drgs.integrator.light.surfaces.Surfaces of the last scene that has some
     too_close: frozenset[str] = frozenset()  # ids of objects with a logged warning
@@ -171,11 +171,6 @@ class SplatsState:
         return own | {f"{name}.": one for name, one in self.nested_objects.items()}
 
     @property
-    def has_smoothing(self) -> bool:
-        """True if Gaussians have a smoothing filter, ignored or not."""
-        return any(one.gaussians.smoothing is not None for one in self.objects.values())
-
-    @property
     def sh_degree(self) -> int:
         """Highest spherical harmonics degree that is evaluated."""
         if self.given_degree is not None:
@@ -218,7 +213,8 @@ class SplatsState:
         settings = self.approximations, self.sh_degree, of_smoothing, kinds
 
         def make() -> rendering.Pipeline:
-            others = [feature_of(kind) for kind in kinds if kind != "alpha"]
+            own = {"depth": rendering.depth_feature, "normal": normal_features}
+            others = [own.get(kind) or NamedFeature(kind) for kind in kinds if kind != "alpha"]
             pipeline = pipeline_of(*settings[:2], (rendering.color_features, *others))
             return replace(pipeline, of_smoothing=of_smoothing)
 
@@ -326,7 +322,7 @@ class SplatsState:
         cache, self.cache.shaded = self.cache, None
         for one in self.objects.values():  # an update that was refused may have left rows
             check_shapes(self.rendered_part_of(one))
-        cache.instances = check_instances(scene, cache.instances)
+        check_instances(scene)
         shapes = ellipsoids_in(scene)
         cache.has_ellipsoids = bool(shapes)
         with dr.resume_grad():
@@ -361,11 +357,12 @@ class SplatsState:
         return parts
 
     def _placements(self) -> list[Placement]:
-        from drgs.integrator.parts import Placement
+        from drgs.integrator.parts import TO_WORLD, Placement
 
         return [
-            Placement.from_matrix(
-                self.rendered_part_of(one), one.to_world.matrix, f"splats: {k}to_world"
+            Placement(
+                {**self.rendered_part_of(one).arrays, TO_WORLD: one.to_world.matrix},
+                f"splats: {k}to_world",
             )
             for k, one in self.objects.items()
         ]
@@ -411,6 +408,7 @@ def check_shapes(gaussians: Gaussians) -> None:
         "logit_opacities": [()],
         "sh0": [(1, 3)],
         "shN": [((degree + 1) ** 2 - 1, 3) for degree in range(4)],
+        **({} if gaussians.smoothing is None else {"smoothing": [()]}),
     }
     for name, allowed in rows.items():
         got = tuple(getattr(gaussians, name).shape)
@@ -426,11 +424,6 @@ def check_shapes(gaussians: Gaussians) -> None:
                 f"splats: {name} must have the shape (N, C), with N = {num} the rows of means and "
                 f"C at least 1, got {tuple(tensor.shape)}"
             )
-    if gaussians.smoothing is not None and dr.width(gaussians.smoothing) != num:
-        raise PluginError(
-            f"splats: smoothing must have the shape (N), with N = {num} the rows of means, got "
-            f"({dr.width(gaussians.smoothing)},)"
-        )
 
 
 def check_degree(degree: int, gaussians: Gaussians) -> None:
@@ -452,20 +445,18 @@ def surfaces_in(scene: mi.Scene) -> list[mi.Shape]:
     return [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
 
 
-def check_instances(scene: mi.Scene, last: Sequence[mi.Shape]) -> list[mi.Shape]:
-    """Raise UnsupportedError for instances of Gaussians; last: those already checked."""
-    instances = [shape for shape in scene.shapes() if shape.class_name() == "Instance"]
-    if not instances or list(map(id, instances)) == list(map(id, last)):
-        return instances
-    repeated, shapes = mi.traverse(scene).hierarchy, scene.shapes()
-    for node, (group, _) in repeated.items():
+def check_instances(scene: mi.Scene) -> None:
+    """Raise UnsupportedError for instances of Gaussians."""
+    shapes = scene.shapes()
+    if all(shape.class_name() != "Instance" for shape in shapes):
+        return
+    for node, (group, _) in mi.traverse(scene).hierarchy.items():
         if isinstance(node, mi.Shape) and node.is_ellipsoids() and node not in shapes:
             raise UnsupportedError(
                 f"splats: shape group '{group.id()}' holds Gaussians (shape '{node.id()}'), whose "
                 "instances are not supported: use a shape of type ellipsoids for each, with a "
                 "to_world, or a nested splats"
             )
-    return instances
 
 
 def feature_widths(objects: dict[str, SplatObject]) -> dict[str, int]:
@@ -481,10 +472,33 @@ def feature_widths(objects: dict[str, SplatObject]) -> dict[str, int]:
     return widths
 
 
-def feature_of(kind: str) -> rendering.Feature:
-    """Return the composited feature of an AOV of this kind, other than alpha."""
-    if kind == "depth":
-        return rendering.depth_feature
-    from drgs.effects.compose import NamedFeature, normal_features
+if TYPE_CHECKING:
 
-    return normal_features if kind == "normal" else NamedFeature(kind)
+    class SplatsPlugin(mi.Integrator):
+        """Members of the plugin ``splats``, whose class exists once for each variant."""
+
+        state: SplatsState
+        gaussians: Gaussians
+        sh_degree: int
+        smoothing: Float | None
+        near: float
+        ignore: Sequence[str]
+        pipeline: rendering.Pipeline
+        last: BackwardResult  # after a backward pass
+        projected_view: ProjectedView | None
+
+        def forget_frames(self) -> None:
+            """Clear the cached frames."""
+            ...
+
+        def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str:
+            """Return a summary of the simulated effects."""
+            ...
+
+else:
+    SplatsPlugin = Any
+
+
+def is_splats(node: object) -> TypeGuard[SplatsPlugin]:
+    """Return whether a Mitsuba object is the integrator ``splats``."""
+    return isinstance(getattr(node, "state", None), SplatsState)

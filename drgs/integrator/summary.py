@@ -37,7 +37,7 @@ def format_effects(effects: Sequence[SimulatedEffect]) -> str:
 def summary_of_scene(splats: SplatsState, scene: mi.Scene, sensors: Sequence[mi.Sensor]) -> str:
     """Return the summary of the integrator ``splats``, whose Gaussians are up to date."""
     alone = [one for sensor in sensors for one in sensors_of(sensor)]
-    cameras = [camera_from_sensor(read_sensor(one, splats.near).detach()) for one in alone]
+    cameras = [camera_from_sensor(read_sensor(one, splats.near)) for one in alone]
     count = len(surfaces_in(scene))
     return format_effects(summary_of_sensors(splats, cameras, scene.environment(), count))
 
@@ -114,7 +114,8 @@ def _summary_of_integrator(
             "the Gaussians' filter" if smooth else None,
         ),
     ]
-    if splats.has_smoothing and not smooth:
+    own = [one.gaussians.smoothing for one in splats.objects.values()]
+    if not smooth and any(filters is not None for filters in own):
         effects.append(SimulatedEffect("smoothing filter", None, ignored=True))
     others = splats.approximations.non_default
     values = [f"{k} = {v}" for k, v in others.items() if k in from_header and k != "antialiased"]

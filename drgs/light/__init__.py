@@ -1,4 +1,1 @@
-"""Light between splats and surfaces along rays, imported where a scene uses it.
-
-May import ``splatting``, ``config``, ``gaussians``, ``cameras`` and ``core``.
-"""
+"""Light between splats and surfaces along rays, imported where a scene uses it."""

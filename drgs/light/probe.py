@@ -64,13 +64,13 @@ class Probes:
         pipeline: rendering.Pipeline,
         centers: np.ndarray,
         near: float,
-        decode: Callable[[list[Float]], list[Float]],
+        decode: Callable[[Float], Float],
         planes: np.ndarray | None = None,
     ) -> Probes:
         """Render probes.
 
         pipeline: with the features colour and depth; centers: (P, 3) world; near: near plane, world
-        units; decode: of composited colours; planes: (P, 4), normal n and offset h of each probe,
+        units; decode: of colours; planes: (P, 4), normal n and offset h of each probe,
         which only sees splats at n . x >= h.
         """
         t = types_of(type(gaussians.means.array))
@@ -270,7 +270,7 @@ def _face(
     gaussians: Gaussians,
     pipeline: rendering.Pipeline,
     near: float,
-    decode: Callable[[list[Float]], list[Float]],
+    decode: Callable[[Float], Float],
 ) -> list[Float]:
     """Render red, green, blue, coverage, nearness of a cube's side (+x, -x, ...) with borders."""
     Float = type(gaussians.means.array)
@@ -287,7 +287,7 @@ def _face(
     T, *color, depth = rendering.render(gaussians, camera, pipeline).planes()
     coverage = 1 - T
     shows = coverage > 0
-    color = decode([c / dr.select(shows, coverage, 1) for c in color])
+    color = [decode(c / dr.select(shows, coverage, 1)) for c in color]
     texel = dr.arange(UInt32, edge * edge)
     x, y = (
         (Float(p) + (0.5 - edge / 2)) * (2 / CUBE_SIZE_TEXELS)

@@ -11,7 +11,7 @@ import numpy as np
 
 from drgs.core.errors import PluginError, UserError, reason_of_mitsuba
 from drgs.core.files import shorten_stem
-from drgs.integrator.types import is_splats
+from drgs.integrator.state import is_splats
 from drgs.io.images import write_exr
 from drgs.io.scenes import load_scene_file
 from drgs.results.files import ERROR_BUDGET

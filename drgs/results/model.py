@@ -33,9 +33,8 @@ from drgs.integrator.scene import (
     make_sensors,
     render_views,
 )
-from drgs.integrator.state import SplatsState
+from drgs.integrator.state import SplatsState, is_splats
 from drgs.integrator.summary import format_effects, summary_of_views
-from drgs.integrator.types import is_splats
 from drgs.io.images import write_png
 from drgs.results.files import CONFIG, ERROR_BUDGET, GAUSSIANS
 from drgs.results.folder import relocate_data, require_results

@@ -1,4 +1,1 @@
-"""The method: projection, tiles, compositing, and the adjoint of each.
-
-May import ``gaussians``, ``cameras`` and ``core``.
-"""
+"""The method: projection, tiles, compositing, and the adjoint of each."""

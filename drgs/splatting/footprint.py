@@ -36,10 +36,6 @@ from drgs.core.types import Array2f, Bool, Float
 from drgs.splatting.grid import MICRO, Lanes, TileGrid
 from drgs.splatting.projection import Splats2D, dot
 
-# ----------------------------------------------------------------------------------------------
-# Alpha
-# ----------------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True)
 class Cutoffs:
@@ -90,11 +86,6 @@ def exp2_short(x: Float) -> Float:
     return reinterpret(t.Float, reinterpret(t.Int32, p) + exponent)
 
 
-def exp2_function(Float: type) -> Callable[[Float], Float]:
-    """The exponential that compositing uses in this precision."""
-    return dr.exp2 if is_float64(Float) else exp2_short
-
-
 @dataclass(frozen=True)
 class Alpha:
     """Alpha at one pixel, with the decisions taken on the way."""
@@ -106,22 +97,15 @@ class Alpha:
     def from_log2(log2_alpha: Float, floor: Float | float, alpha_max: float) -> Alpha:
         """alpha = min(alpha_max, 2^log2_alpha), or 0 where log2_alpha is below ``floor``."""
         # Far below the floor the short exp2 returns garbage; the selection discards it.
-        unclamped = exp2_function(type(log2_alpha))(log2_alpha)
+        exp2 = dr.exp2 if is_float64(type(log2_alpha)) else exp2_short
+        unclamped = exp2(log2_alpha)
         smooth = unclamped < alpha_max
         value = dr.select(smooth, unclamped, alpha_max)
         return Alpha(value=dr.select(log2_alpha >= floor, value, 0), smooth=smooth)
 
 
-# ----------------------------------------------------------------------------------------------
-# Sample positions
-# ----------------------------------------------------------------------------------------------
-
-
 class SamplePositions:
-    """Points of the pixels at which splats are evaluated. Grids of 16 values: 4 rows of 4.
-
-    Sums are those of points anywhere in their pixels.
-    """
+    """Points of the pixels at which splats are evaluated. Sums are of points anywhere in them."""
 
     margin: ClassVar[float] = 0.0  # px: distance from a pixel's centre to its point, at most
     samples: int = 1  # times that each pixel is evaluated
@@ -135,25 +119,25 @@ class SamplePositions:
         """Return x and y (px) of the 16 pixels."""
         raise NotImplementedError
 
-    def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
-        """Return grids of x and y, from a point of the film to the pixels, px."""
+    def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list[Float], list[Float]]:
+        """Return x and y from a point of the film to the 16 pixels, px."""
         raise NotImplementedError
 
     def sum(self, values: list[Float]) -> Float:
         """Sum 16 values."""
         return total(values)
 
-    def sum_dx(self, values: list[Float], dx: list) -> Float:
-        """Sum values times dx, a grid of :meth:`offsets`."""
-        return total(_products(values, dx))
+    def sum_dx(self, values: list[Float], dx: list[Float]) -> Float:
+        """Sum values times dx of :meth:`offsets`."""
+        return total(products(values, dx))
 
-    def sum_dy(self, values: list[Float], dy: list) -> Float:
+    def sum_dy(self, values: list[Float], dy: list[Float]) -> Float:
         """Sum values times dy."""
-        return total(_products(values, dy))
+        return total(products(values, dy))
 
-    def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
+    def sum_dy_dy(self, values: list[Float], dy: list[Float]) -> Float:
         """Sum values times dy^2."""
-        return total(_products(_products(values, dy), dy))
+        return total(products(products(values, dy), dy))
 
 
 @dataclass(frozen=True)
@@ -166,39 +150,32 @@ class PixelCenters(SamplePositions):
         return [(x + i, y + j) for j in range(MICRO) for i in range(MICRO)]
 
     @override
-    def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
+    def offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list[Float], list[Float]]:
         t = types_of(type(x))
         first_x, first_y = t.Float(lanes.x) + 0.5 - x, t.Float(lanes.y) + 0.5 - y
-        dx = [first_x + i for i in range(MICRO)]
-        dy = [first_y + j for j in range(MICRO)]
-        return [dx] * MICRO, [[d] * MICRO for d in dy]
+        columns, rows = ([first + k for k in range(MICRO)] for first in (first_x, first_y))
+        return columns * MICRO, [dy for dy in rows for _ in range(MICRO)]
 
     @override
     def sum(self, values: list[Float]) -> Float:
         return total(self._rows(values))
 
     @override
-    def sum_dx(self, values: list[Float], dx: list) -> Float:
+    def sum_dx(self, values: list[Float], dx: list[Float]) -> Float:
         """Sum values times dx: a column shares dx, so columns are summed first."""
-        columns = [total([values[MICRO * j + i] for j in range(MICRO)]) for i in range(MICRO)]
-        return dot(columns, dx[0])
+        return dot([total(values[i::MICRO]) for i in range(MICRO)], dx[:MICRO])
 
     @override
-    def sum_dy(self, values: list[Float], dy: list) -> Float:
-        return dot(self._rows(values), _first_of_rows(dy))
+    def sum_dy(self, values: list[Float], dy: list[Float]) -> Float:
+        return dot(self._rows(values), dy[::MICRO])
 
     @override
-    def sum_dy_dy(self, values: list[Float], dy: list) -> Float:
-        dy = _first_of_rows(dy)
-        return dot([a * b for a, b in zip(self._rows(values), dy, strict=True)], dy)
+    def sum_dy_dy(self, values: list[Float], dy: list[Float]) -> Float:
+        return dot(products(self._rows(values), dy[::MICRO]), dy[::MICRO])
 
     @staticmethod
     def _rows(values: list[Float]) -> list[Float]:
         return [total(values[MICRO * j : MICRO * j + MICRO]) for j in range(MICRO)]
-
-
-def _first_of_rows(rows: list) -> list[Float]:
-    return [row[0] for row in rows]
 
 
 def total(values: list[Float]) -> Float:
@@ -208,33 +185,24 @@ def total(values: list[Float]) -> Float:
     return values[0]
 
 
-def flat_columns(rows: list) -> list[Float]:
-    """Flatten 4 rows of 4 values."""
-    return [value for row in rows for value in row]
-
-
-def _products(values: list[Float], grid: list[list[Float]]) -> list[Float]:
-    return [a * b for a, b in zip(values, flat_columns(grid), strict=True)]
-
-
-# ----------------------------------------------------------------------------------------------
-# Falloff
-# ----------------------------------------------------------------------------------------------
+def products(values: list[Float], others: list[Float]) -> list[Float]:
+    """Multiply two lists number by number."""
+    return [a * b for a, b in zip(values, others, strict=True)]
 
 
 @dataclass(frozen=True)
 class MicroTileFootprint:
-    """A splat at the 16 pixels of a micro-tile; grids are lists of 4 rows of 4."""
+    """A splat at the 16 pixels of a micro-tile, row by row."""
 
-    dx: list  # grid: pixel - mean, px
-    dy: list  # grid, px
-    u: list  # grid: first component of U d, scaled to base 2
-    v: list  # grid: second component
-    log2_alpha: list[Float]  # 16: unclamped
+    dx: list[Float]  # pixel - mean, px
+    dy: list[Float]
+    u: list[Float]  # first component of U d, scaled to base 2
+    v: list[Float]  # second component
+    log2_alpha: list[Float]  # unclamped
 
 
-Offsets = Callable[[Float, Float], tuple[list, list]]
-"""From a point of the film, x and y (px), to grids of offsets from it to the 16 pixels."""
+Offsets = Callable[[Float, Float], tuple[list[Float], list[Float]]]
+"""From a point of the film, x and y (px), to the offsets from it to the 16 pixels."""
 
 
 @FALLOFFS.register("gaussian")
@@ -256,7 +224,7 @@ class GaussianFalloff:
     @property
     def num_moments(self) -> int:
         """Sums over pixels, by splat."""
-        return 6
+        return self.num_geometry
 
     def for_camera(self, camera: Camera) -> GaussianFalloff:
         """Return this falloff for one camera; here, it is independent of the camera."""
@@ -308,22 +276,17 @@ class GaussianFalloff:
         x, y, p, r, s, log2_opacity = geometry
         log2_opacity = dr.select(active, log2_opacity, -dr.inf)
         dx, dy = offsets_from(x, y)
-        u = [
-            [p * x + r * y for x, y in zip(*rows, strict=True)] for rows in zip(dx, dy, strict=True)
-        ]
-        v = [[s * y for y in row] for row in dy]
-        log2_alpha = [
-            dr.fma(-a, a, dr.fma(-b, b, log2_opacity))
-            for a, b in zip(flat_columns(u), flat_columns(v), strict=True)
-        ]
-        return MicroTileFootprint(dx=dx, dy=dy, u=u, v=v, log2_alpha=log2_alpha)
+        u = [p * x + r * y for x, y in zip(dx, dy, strict=True)]
+        v = [s * y for y in dy]
+        log2_alpha = [dr.fma(-a, a, dr.fma(-b, b, log2_opacity)) for a, b in zip(u, v, strict=True)]
+        return MicroTileFootprint(dx, dy, u, v, log2_alpha)
 
     def moments(
         self, footprint: MicroTileFootprint, weights: list[Float], positions: SamplePositions
     ) -> list[Float]:
         """Sums over the 16 pixels of w = d loss / d ln(alpha) times 1, u, u dx, u dy, dy, dy^2."""
         dx, dy = footprint.dx, footprint.dy
-        z = [a * b for a, b in zip(weights, flat_columns(footprint.u), strict=True)]
+        z = products(weights, footprint.u)
         return [
             positions.sum(weights),
             positions.sum(z),
@@ -366,18 +329,13 @@ class GaussianFalloff:
         d_p, d_r, d_s = d_p * WHITENING_SCALE, d_r * WHITENING_SCALE, d_s * WHITENING_SCALE
         scale = 2 * math.log(2)
         result = []
-        grids = map(flat_columns, (footprint.dx, footprint.dy, footprint.u, footprint.v))
-        for dx, dy, u, v in zip(*grids, strict=True):
+        pixels = zip(footprint.dx, footprint.dy, footprint.u, footprint.v, strict=True)
+        for dx, dy, u, v in pixels:
             dv = dr.fma(d_s, dy, -s * d_y)
             d_row = dr.fma(-scale * v, dv, d_log_opacity)
             du_row = dr.fma(d_r, dy, -dr.fma(p, d_x, r * d_y))
             result.append(dr.fma(-scale * u, dr.fma(d_p, dx, du_row), d_row))
         return result
-
-
-# ----------------------------------------------------------------------------------------------
-# Features
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -493,20 +451,10 @@ class ImageModel:
             period=camera.lens.period(camera),
         )
 
-    def check_differentiable_in_camera(self) -> None:
-        """Raise UnsupportedError if pixels depend on the camera but through the splats."""
-        self.features.check_differentiable_in_camera()
-
     def bind(self, lanes: Lanes, grid: TileGrid) -> ImageModel:
         """Return this model for the lanes of one kernel, with inputs loaded before the loop."""
         positions = self.positions.bind(lanes, grid)
-        return ImageModel(
-            falloff=self.falloff,
-            positions=positions,
-            features=self.features.bind(lanes, positions),
-            cutoffs=self.cutoffs,
-            period=self.period,
-        )
+        return replace(self, positions=positions, features=self.features.bind(lanes, positions))
 
     def footprint(
         self, geometry: list[Float], lanes: Lanes, active: Bool | bool
@@ -518,10 +466,10 @@ class ImageModel:
         """Return where a point at x, px, is seen next to a mean at ``mean_x``."""
         return x if self.period is None else mean_x + shortest(x - mean_x, self.period)
 
-    def _offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list, list]:
-        """Return grids of x and y, px, from a mean to the pixels; with a period, the nearest."""
+    def _offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list[Float], list[Float]]:
+        """Return x and y, px, from a mean to the pixels; with a period, the nearest."""
         dx, dy = self.positions.offsets(lanes, x, y)
-        return [[shortest(each, self.period) for each in row] for row in dx], dy
+        return [shortest(each, self.period) for each in dx], dy
 
     def alphas(self, geometry: list[Float], footprint: MicroTileFootprint) -> Iterator[Alpha]:
         """Yield alpha at the 16 pixels.

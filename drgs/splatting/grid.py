@@ -14,15 +14,10 @@ from drgs.core.types import Bool, Float, UInt32
 
 T = TypeVar("T", Float, UInt32)
 
-MICRO = 4
-"""Pixels on a micro-tile's side. A micro-tile is one SIMD lane of the compositing kernels."""
-
+MICRO = 4  # pixels on the side of a micro-tile, one SIMD lane of the compositing kernels
 PIXELS = MICRO * MICRO  # pixels of a micro-tile
-
 GRID = 4  # micro-tiles on a tile's side
-
 TILE = MICRO * GRID  # pixels on a tile's side
-
 MICROS = GRID * GRID  # micro-tiles in a tile: the bits of an entry's mask
 
 
@@ -171,10 +166,7 @@ def load_pixels(plane: Float, lanes: Lanes, grid: TileGrid) -> list[Float]:
 
 
 def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[UInt32, Bool]]:
-    """Return row-major index and on-film mask of the 16 pixels of each micro-tile.
-
-    The index is that in a plane of all samples.
-    """
+    """Return index (in a plane of all samples) and on-film mask of each micro-tile's 16 pixels."""
     UInt32 = type(lanes.x)
     width, height = dr.opaque(UInt32, grid.width), dr.opaque(UInt32, grid.height)
     first_row, pixels = lanes.sample * height, []

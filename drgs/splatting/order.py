@@ -146,32 +146,26 @@ class InGroups(CenterOrder):
         before: SplatGradients | None = None,
     ) -> SplatGradients:
         """See :func:`drgs.splatting.rasterize.composite_adjoint`. One sample is added at a time."""
+        dr.eval(d_planes)  # so that all groups share kernels
+        zeros = dr.opaque(type(d_planes[0]), 0, dr.width(d_planes[0]))
+        zero, num_geometry = tiles.bins.rows.Float(0), tiles.bins.model.falloff.num_geometry
         for sample in samples:
-            gradients = self._adjoint(tiles, d_planes, range(sample, sample + 1))
-            before = gradients if before is None else before.plus(gradients)
+            cotangents = list(d_planes)
+            geometry, features = [zero] * num_geometry, [zero] * tiles.bins.num_features
+            for group, part in _parts(tiles):
+                d_part = [cotangents[place] for place in group.places]
+                for place in group.places:  # planes of several groups count once
+                    cotangents[place] = zeros
+                gradients = self.order.adjoint(part, d_part, range(sample, sample + 1))
+                geometry = [a + b for a, b in zip(geometry, gradients.geometry, strict=True)]
+                for place, derivative in zip(group.stored, gradients.features, strict=True):
+                    features[place] = features[place] + derivative
+                dr.eval(geometry, features)
+            total = SplatGradients(geometry, features)
+            before = total if before is None else before.plus(total)
             dr.eval(before)
         assert before is not None, "there is at least one sample"
         return before
-
-    def _adjoint(
-        self, tiles: CompositedTiles, d_planes: Sequence[Float], samples: range
-    ) -> SplatGradients:
-        """Add the groups' derivatives of one sample."""
-        bins, cotangents = tiles.bins, list(d_planes)
-        dr.eval(cotangents)  # so that all groups share kernels
-        zeros = dr.opaque(type(cotangents[0]), 0, dr.width(cotangents[0]))
-        zero, falloff = bins.rows.Float(0), bins.model.falloff
-        geometry, features = [zero] * falloff.num_geometry, [zero] * bins.num_features
-        for group, part in _parts(tiles):
-            d_part = [cotangents[place] for place in group.places]
-            for place in group.places:  # planes of several groups count once
-                cotangents[place] = zeros
-            gradients = self.order.adjoint(part, d_part, samples)
-            geometry = [a + b for a, b in zip(geometry, gradients.geometry, strict=True)]
-            for place, derivative in zip(group.stored, gradients.features, strict=True):
-                features[place] = features[place] + derivative
-            dr.eval(geometry, features)
-        return SplatGradients(geometry, features)
 
     @override
     def tangent(self, tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:

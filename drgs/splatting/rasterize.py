@@ -93,11 +93,7 @@ class CompositedTiles:
     count: int  # C, planes
 
     def planes(self) -> list[Float]:
-        """Return 1 + C planes in row-major pixel order, Float (samples * H * W,), not evaluated.
-
-        The first is T, the transmittance of the background; then sum_i w_i c_i for each component
-        of c.
-        """
+        """Return T, then sum_i w_i c_i: Float (samples * H * W,) each, row-major, not evaluated."""
         return self.unpack(self.values)
 
     def unpack(self, values: Float) -> list[Float]:
@@ -166,16 +162,8 @@ class Records:
         return self.rows.load(entry, active)[self.num_geometry + self.num_features :]
 
 
-# ----------------------------------------------------------------------------------------------
-# Forward
-# ----------------------------------------------------------------------------------------------
-
-
 def composite(bins: TileBins, records: Records) -> CompositedTiles:
-    """Composite the features of all splats.
-
-    bins: from ``bin_splats``; records: ``Records.from_ranks(bins, bins.rows.load)``.
-    """
+    """Composite the features of all splats; records: of ``bins.rows.load``."""
     t = types_of(bins.rows.Float)
     lanes = make_lanes(t.Float, bins.grid)
     end = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
@@ -231,7 +219,7 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
         records=records,
         values=scatter_rows(columns, lanes.micro_tile, size),
         ends=scatter_rows(ends, lanes.micro_tile, size),
-        stop=scatter_rows([largest(ends)], lanes.micro_tile, size),
+        stop=scatter_rows([reduce(_larger, ends)], lanes.micro_tile, size),
         count=count,
     )
     dr.eval(stored.values, stored.ends, stored.stop)
@@ -248,17 +236,9 @@ def any_unfinished(transmittances: list[Float]) -> Bool:
     return reduce(and_, map(sign_bits, transmittances)) >= 0
 
 
-def largest(values: list[UInt32]) -> UInt32:
-    """Return the largest of several numbers, lane by lane."""
-    result = values[0]
-    for v in values[1:]:
-        result = dr.select(v > result, v, result)
-    return result
+def _larger(a: UInt32, b: UInt32) -> UInt32:
+    return dr.select(b > a, b, a)
 
-
-# ----------------------------------------------------------------------------------------------
-# Adjoint
-# ----------------------------------------------------------------------------------------------
 
 SPARE_ROWS = 64  # behind the slots, for sums of lanes without a splat
 
@@ -283,11 +263,6 @@ class SplatGradients:
     def means2d(self) -> Array2f:
         """Derivatives of the means on the film, loss per px."""
         return types_of(type(self.geometry[0])).Array2f(self.geometry[:2])
-
-    @property
-    def opacities(self) -> Float:
-        """Derivatives of the opacities."""
-        return self.geometry[5]
 
 
 def composite_adjoint(
@@ -359,11 +334,7 @@ def _partials(tiles: CompositedTiles, slots: Slots, d_planes: Sequence[Float]) -
         return cursor, slot, pixels
 
     loop = dr.while_loop(
-        state=(
-            entries.begin(),
-            slots.end(entries),
-            last,
-        ),
+        state=(entries.begin(), slots.end(entries), last),
         cond=lambda cursor, slot, pixels: entries.pending(cursor),
         body=body,
     )
@@ -444,11 +415,6 @@ def splat_gradients(
     dr.eval(rows)
     numbers = rows.load(rank)
     return SplatGradients(geometry=numbers[:count], features=numbers[count:])
-
-
-# ----------------------------------------------------------------------------------------------
-# Tangent (forward mode)
-# ----------------------------------------------------------------------------------------------
 
 
 def composite_tangent(tiles: CompositedTiles, tangents: SplatGradients) -> list[Float]:

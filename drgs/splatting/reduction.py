@@ -217,10 +217,7 @@ def sum_entries(
         return micros, totals
 
     _, totals = dr.while_loop(
-        state=(
-            t.UInt32(micros),
-            [t.Float(zero) for _ in range(partials.width)],
-        ),
+        state=(t.UInt32(micros), [t.Float(zero) for _ in range(partials.width)]),
         cond=lambda micros, totals: micros != 0,
         body=body,
     )

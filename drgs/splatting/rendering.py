@@ -116,10 +116,7 @@ class Frame:
     tiles: CompositedTiles  # of that order
 
     def planes(self) -> list[Float]:
-        """Return transmittance, then the pipeline's features, unevaluated.
-
-        Each is Float (samples * H * W,), sample by sample.
-        """
+        """Return transmittance, then the features: see :meth:`.CompositedTiles.planes`."""
         return self.tiles.planes()
 
 
@@ -194,10 +191,12 @@ def frames_adjoint(
 
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
-    of_splats = splats_adjoint(frames, d_planes)
-    camera, pipeline = frames[0].camera, frames[0].pipeline
-    gradients = gradients_of(gaussians, camera, pipeline, of_splats, with_camera)
-    return replace(gradients, visible=on_film(frames[0].tiles.bins))
+    of_splats, first = splats_adjoint(frames, d_planes), frames[0]
+    given = CameraGradients(first.camera, first.pipeline, of_splats)
+    total, by_row = gradients_by_row(gaussians, given, with_camera)
+    # dr.sum adds in the same order in every run.
+    camera = [dr.sum(each) for each in by_row] if with_camera else None
+    return replace(total, visible=on_film(first.tiles.bins), camera=camera)
 
 
 def splats_adjoint(frames: list[Frame], d_planes: list[list[Float]]) -> SplatGradients:
@@ -218,44 +217,6 @@ ENTRIES_AT_ONCE = 1 << 19
 per entry, besides the slots, whose memory is bounded separately."""
 
 
-def gradients_of(
-    gaussians: Gaussians,
-    camera: Camera,
-    pipeline: Pipeline,
-    of_splats: SplatGradients,
-    with_camera: bool = False,
-) -> GaussianGradients:
-    """Return derivatives of the parameters, given those of the 2D splats, by Dr.Jit.
-
-    See :func:`frames_adjoint`; ``visible`` does not include the bounds of the film.
-    """
-    total, by_row = gradients_by_row(gaussians, camera, pipeline, of_splats, with_camera)
-    # dr.sum adds in the same order in every run.
-    return replace(total, camera=[dr.sum(each) for each in by_row]) if with_camera else total
-
-
-def gradients_by_row(
-    gaussians: Gaussians,
-    camera: Camera,
-    pipeline: Pipeline,
-    of_splats: SplatGradients,
-    with_camera: bool,
-) -> tuple[GaussianGradients, list[Float]]:
-    """Return :func:`gradients_of`, and each Gaussian's contribution to the camera's derivatives.
-
-    Contributions are evaluated: (N,) for each of ``camera.numbers()``; none without
-    ``with_camera``.
-    """
-    rows = load_rows(gaussians, pipeline.sh_degree)
-    d_rows, visible, d_numbers = _back_to_rows(rows, camera, pipeline, of_splats, with_camera)
-    columns = _columns_of(d_rows, gaussians, visible)
-    faults = _nonfinite_flags(d_rows, visible)
-    parameters = _as_tensors(columns, gaussians, [faults])
-    by_row = [dr.select(visible, number, 0) for number in d_numbers]
-    dr.eval(by_row)
-    return GaussianGradients(parameters, of_splats.means2d, visible, dr.min(faults)), by_row
-
-
 @dataclass(frozen=True)
 class CameraGradients:
     """The derivatives of the 2D splats of one camera."""
@@ -265,10 +226,29 @@ class CameraGradients:
     gradients: SplatGradients
 
 
+def gradients_by_row(
+    gaussians: Gaussians, given: CameraGradients, with_camera: bool = False
+) -> tuple[GaussianGradients, list[Float]]:
+    """Return derivatives of the parameters, and each Gaussian's contribution to the camera's.
+
+    Dr.Jit computes them from those of the 2D splats; ``visible`` does not include the bounds of the
+    film. Contributions are evaluated: (N,) for each of ``camera.numbers()``; none without
+    ``with_camera``.
+    """
+    rows = load_rows(gaussians, given.pipeline.sh_degree)
+    d_rows, visible, d_numbers = _back_to_rows(rows, given, with_camera)
+    columns = _columns_of(d_rows, gaussians, visible)
+    faults = _nonfinite_flags(d_rows, visible)
+    parameters = _as_tensors(columns, gaussians, [faults])
+    by_row = [dr.select(visible, number, 0) for number in d_numbers]
+    dr.eval(by_row)
+    return GaussianGradients(parameters, given.gradients.means2d, visible, dr.min(faults)), by_row
+
+
 def sum_of_views(
     gaussians: Gaussians, views: Sequence[Sequence[CameraGradients]]
 ) -> tuple[Gaussians, list[UInt32]]:
-    """Sum :func:`gradients_of` over several views, in one kernel.
+    """Sum :func:`gradients_by_row` over several views, in one kernel.
 
     views: the derivatives at each time of each view, added in this order. Shared values are
     computed once, and the sum stays in registers.
@@ -281,34 +261,27 @@ def sum_of_views(
         flags = []
         for each in view:
             copy = dr.copy(rows)  # separates the derivatives of the cameras
-            d_rows, visible, _ = _back_to_rows(copy, each.camera, each.pipeline, each.gradients)
-            columns = _columns_of(d_rows, gaussians, visible)
-            total = _sum_of_columns(total, columns) if total else columns
+            d_rows, visible, _ = _back_to_rows(copy, each)
+            for name, columns in _columns_of(d_rows, gaussians, visible).items():
+                terms = zip(total[name], columns, strict=True) if name in total else ()
+                total[name] = [a + b for a, b in terms] or columns
             flags.append(_nonfinite_flags(d_rows, visible))
         faults.append(reduce(dr.minimum, flags))
     return _as_tensors(total, gaussians, faults), [dr.min(each) for each in faults]
 
 
-def _sum_of_columns(a: dict[str, list[Float]], b: dict[str, list[Float]]) -> dict[str, list[Float]]:
-    return {name: [x + y for x, y in zip(v, b[name], strict=True)] for name, v in a.items()}
-
-
 def _back_to_rows(
-    rows: GaussianRows,
-    camera: Camera,
-    pipeline: Pipeline,
-    of_splats: SplatGradients,
-    with_camera: bool = False,
+    rows: GaussianRows, given: CameraGradients, with_camera: bool = False
 ) -> tuple[GaussianRows, Bool, list[Float]]:
     """Return derivatives per lane, the visible lanes, and derivatives of the camera's numbers."""
     with dr.resume_grad():
-        inputs, splats, outputs = _attach(rows, camera, pipeline, with_camera)
-        cotangents = of_splats.geometry + of_splats.features
+        inputs, splats, outputs = _attach(rows, given.camera, given.pipeline, with_camera)
+        cotangents = given.gradients.geometry + given.gradients.features
         for output, cotangent in zip(outputs, cotangents, strict=True):
             dr.accum_grad(output, cotangent)
         dr.enqueue(dr.ADMode.Backward, outputs)
         dr.traverse(dr.ADMode.Backward)
-        d_rows = pipeline.select_differentiable(dr.grad(rows))
+        d_rows = given.pipeline.select_differentiable(dr.grad(rows))
         return d_rows, dr.detach(splats.visible), [dr.grad(number) for number in inputs[1]]
 
 
@@ -322,7 +295,7 @@ def _attach(
     """
     numbers, falloff = [], pipeline.model.for_camera(camera).falloff
     if with_camera:
-        pipeline.model.check_differentiable_in_camera()
+        pipeline.model.features.check_differentiable_in_camera()
         camera = camera.by_lane(dr.width(rows.logit_opacities))
         numbers = camera.numbers()
     inputs = pipeline.select_differentiable(rows), numbers
@@ -352,8 +325,10 @@ def weighted_sums(frame: Frame, *planes: Float) -> list[Float]:
 
 def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
     """Add the derivatives of a loss that depends on several cameras."""
+    others = b.parameters.arrays
+    sums = {name: v + others[name] for name, v in a.parameters.arrays.items()}
     total = GaussianGradients(
-        parameters=_sum_of(a.parameters, b.parameters),
+        parameters=Gaussians.from_arrays(sums),
         means2d=a.means2d + b.means2d,
         visible=a.visible | b.visible,
         first_nonfinite=dr.select(
@@ -363,11 +338,6 @@ def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGrad
     )
     dr.eval(total)
     return total
-
-
-def _sum_of(a: Gaussians, b: Gaussians) -> Gaussians:
-    others = b.arrays
-    return Gaussians.from_arrays({name: v + others[name] for name, v in a.arrays.items()})
 
 
 def decode_nonfinite(fault: int) -> tuple[int, str] | None:
@@ -400,18 +370,8 @@ def frames_tangent(
 
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
-    direction = _splat_tangents(gaussians, frames[0], tangents, camera_tangents)
-    return [frame.order.tangent(frame.tiles, direction) for frame in frames]
-
-
-def _splat_tangents(
-    gaussians: Gaussians,
-    frame: Frame,
-    tangents: Gaussians,
-    camera_tangents: list[Float] | None = None,
-) -> SplatGradients:
-    """Return tangents of the 2D splats, given those of the parameters, by Dr.Jit."""
-    pipeline, with_camera = frame.pipeline, camera_tangents is not None
+    frame, with_camera = frames[0], camera_tangents is not None
+    pipeline = frame.pipeline
     rows = load_rows(gaussians, pipeline.sh_degree)
     d_rows = load_rows(tangents, pipeline.sh_degree)
     with dr.resume_grad():
@@ -423,7 +383,8 @@ def _splat_tangents(
         columns = [dr.grad(output) for output in outputs]
     dr.eval(columns)
     count = frame.tiles.bins.model.falloff.num_geometry
-    return SplatGradients(geometry=columns[:count], features=columns[count:])
+    direction = SplatGradients(geometry=columns[:count], features=columns[count:])
+    return [frame.order.tangent(frame.tiles, direction) for frame in frames]
 
 
 def _columns_of(

@@ -95,16 +95,19 @@ def splat_table(
     features: columns, Float (N,) each, to composite; keys: further columns, for the order. Neither
     they nor the splats need to be evaluated: the kernel that computes them stores the rows.
     """
-    boxes, rows, depths = _store_rows(splats, grid, [*features, *keys], model)
+    geometry = model.falloff.geometry(splats)
+    boxes = Rows.from_columns(_tile_box(splats, geometry, grid, model))
+    rows = Rows.from_columns([*geometry, *features, *keys])
+    depths = dr.select(splats.visible, splats.depths, dr.inf)
+    dr.eval(boxes, rows, depths)
     return SplatTable(boxes, rows, depths, len(features), len(keys))
 
 
 def bin_splats(table: SplatTable, grid: TileGrid, model: ImageModel) -> TileBins:
     """Distribute splats over the tiles of ``grid``, front to back.
 
-    Not differentiated. The host reads one value, the number of entries.
-
-    Raises UserError if there are more than 2^26 Gaussians.
+    Not differentiated. The host reads one value, the number of entries. Raises UserError if there
+    are more than 2^26 Gaussians.
     """
     boxes, rows, depths = table.boxes, table.rows, table.depths
     num_features, num_keys = table.num_features, table.num_keys
@@ -119,11 +122,8 @@ def bin_splats(table: SplatTable, grid: TileGrid, model: ImageModel) -> TileBins
     order = t.UInt32(dr.argsort(depths))
     # In a separate kernel: loads without arithmetic overlap their latencies.
     box = boxes.load(order)
-    boxes, rows, counts = (
-        Rows.from_columns(box),
-        Rows.from_columns(rows.load(order)),
-        t.UInt32(box[-1]),
-    )
+    boxes, rows = Rows.from_columns(box), Rows.from_columns(rows.load(order))
+    counts = t.UInt32(box[-1])
     dr.eval(boxes, rows, counts)
     num_splats = dr.width(order)
     rank = dr.arange(t.UInt32, num_splats + 1)
@@ -156,20 +156,6 @@ def bin_splats(table: SplatTable, grid: TileGrid, model: ImageModel) -> TileBins
         grid=grid,
         model=model,
     )
-
-
-def _store_rows(
-    splats: Splats2D, grid: TileGrid, stored: Sequence[Float], model: ImageModel
-) -> tuple[Rows, Rows, Float]:
-    """Return, by Gaussian, boxes of tiles, all other numbers, and depths to sort by; evaluated."""
-    geometry = model.falloff.geometry(splats)
-    boxes, rows = (
-        Rows.from_columns(_tile_box(splats, geometry, grid, model)),
-        Rows.from_columns([*geometry, *stored]),
-    )
-    depths = dr.select(splats.visible, splats.depths, dr.inf)
-    dr.eval(boxes, rows, depths)
-    return boxes, rows, depths
 
 
 def _reach(geometry: list[Float], grid: TileGrid, model: ImageModel) -> Float:
@@ -429,10 +415,7 @@ class Entries:
 
     @staticmethod
     def current(cursor: Cursor) -> tuple[UInt32, Bool]:
-        """The current sorted entry, and whether there is one (a word may be empty).
-
-        Where there is none, it is one of the entries of the cursor's group.
-        """
+        """The current sorted entry, and whether there is one; else it is any of its group."""
         return cursor.group * WORD + find_lowest_bit(cursor.word), cursor.word != 0
 
     def advance(self, cursor: Cursor) -> Cursor:

@@ -21,7 +21,7 @@ from drgs.datasets.storage import is_on_disk
 from drgs.datasets.types import View
 from drgs.effects.base import TrainingEffect
 from drgs.integrator.scene import make_sensors
-from drgs.integrator.types import SplatsPlugin
+from drgs.integrator.state import SplatsPlugin
 from drgs.training.losses import TARGET_BYTES
 from drgs.training.rates import LearningRates
 from drgs.training.views import TrainingView

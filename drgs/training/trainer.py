@@ -31,7 +31,7 @@ from drgs.effects.base import TrainingEffect, integrator_settings, training_effe
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
-from drgs.integrator.types import SplatsPlugin
+from drgs.integrator.state import SplatsPlugin
 from drgs.splatting.rendering import NO_FAULT
 from drgs.training.density.phases import density_strategy
 from drgs.training.density.strategy import (

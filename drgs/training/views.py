@@ -17,7 +17,7 @@ from drgs.datasets.images import with_arrays
 from drgs.datasets.types import View
 from drgs.effects.base import TrainingEffect, as_tensor
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.integrator.types import SplatsPlugin
+from drgs.integrator.state import SplatsPlugin
 from drgs.training.losses import Target, prepare_target
 
 

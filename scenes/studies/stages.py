@@ -27,7 +27,7 @@ from drgs.core.types import UInt32
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 from drgs.reference import splatting as reference
-from drgs.splatting import order, rasterize, rendering, tiles
+from drgs.splatting import order, rasterize, rendering
 from drgs.splatting.grid import PIXELS, load_lane_row, make_lanes
 from drgs.splatting.tiles import Cursor, Entries
 from drgs.training.trainer import Trainer
@@ -93,7 +93,7 @@ def stage_clock() -> Iterator[StageClock]:
         return call
 
     borders = [
-        (tiles, "_store_rows", None, "projection and SH"),
+        (rendering, "splat_table", None, "projection and SH"),
         (rendering, "bin_splats", None, "binning"),
         (order, "composite", None, "compositing"),
         (order, "composite_adjoint", "image and loss", None),

@@ -45,7 +45,7 @@ def aperture_camera(camera, precision, defocus):
 
 
 def splats_of(gaussians, camera, precision, defocus, rule=plain_opacity, low_pass=0.3):
-    """DirectProjection by the kernels, in focus if ``defocus`` is None."""
+    """Projection by the kernels, in focus if ``defocus`` is None."""
     device = aperture_camera(camera, precision, defocus)
     shape = ewa if defocus is None else Defocused(ewa)
     parameter_rows = load_rows(device_gaussians(gaussians, precision), 0)

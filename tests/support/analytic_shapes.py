@@ -97,7 +97,7 @@ def dataset_of_images(views, half_extent=1.3, background=WHITE, **fields):
 def opaque_at(view, points, lens=PINHOLE):
     """(N,) bool: whether the image shows something at the places of points (N, 3), world.
 
-    DirectProjection by the reference. True where the image does not show them.
+    Projection by the reference. True where the image does not show them.
     """
     camera = reference_camera(view)
     position = (points - view.center) @ view.camera_to_world[:3, :3]

@@ -207,7 +207,7 @@ IMAGE = {FLOAT64: 1e-11, FLOAT32: 2e-5}
 
 
 def splats_of(gaussians, camera, lens, precision, shape=ewa, low_pass=0.3, degree=0):
-    """DirectProjection by the kernels."""
+    """Projection by the kernels."""
     parameter_rows = load_rows(device_gaussians(gaussians, precision), degree)
     camera = lens_camera(camera, lens, precision)
     return project(parameter_rows, camera, degree, plain_opacity, shape, low_pass=low_pass)

@@ -100,7 +100,7 @@ def check_a_peak_in_the_plane_of_the_camera_shows_nothing():
     camera = Case("camera").camera()
 
     def offsets_from(x, y):
-        return [[i + 0.5 - x for i in range(4)]] * 4, [[j + 0.5 - y] * 4 for j in range(4)]
+        return [i + 0.5 - x for i in range(4)] * 4, [k // 4 + 0.5 - y for k in range(16)]
 
     falloff = exact.RayFalloff().for_camera(camera)
     footprint = falloff.footprint(geometry, offsets_from, number(0) == 0)

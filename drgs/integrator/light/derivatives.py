@@ -82,21 +82,13 @@ def check_derivatives(
                 f"splats: {sensor.id()}.{name} is not differentiated in a scene with surfaces, as "
                 "it moves these in the image; detach it, or leave out the surfaces"
             )
-    parameters, reasons = list(attached_parameters(scene)), {}
-    for parameter in parameters:
-        reason = _refusal(parameter, splats)
-        # Mitsuba renders a padded copy of an environment map's texels.
-        node = parameter.owners[0].class_name(), parameter.key
-        is_padded = node == ("EnvironmentMapEmitter", "data")
-        if reason is None and mode == dr.ADMode.Forward and is_padded:
-            reason = "forward mode does not reach its texels; use dr.backward"
-        if reason is not None:
-            reasons.setdefault(reason, []).append(parameter.name)
-    for reason, names in reasons.items():
-        are = "is" if len(names) == 1 else "are"
+    reasons = {p.name: _refusal(p, splats, mode) for p in attached_parameters(scene)}
+    reason = next(filter(None, reasons.values()), None)
+    if reason is not None:
+        names = [name for name, other in reasons.items() if other == reason]
+        are, them = ("is", "it") if len(names) == 1 else ("are", "them")
         raise UnsupportedError(
-            f"splats: {format_names(names)} {are} not differentiated, as {reason}; or detach "
-            f"{'it' if are == 'is' else 'them'}"
+            f"splats: {format_names(names)} {are} not differentiated, as {reason}; or detach {them}"
         )
 
 
@@ -134,7 +126,7 @@ def type_of(integrator: mi.Integrator) -> str:
     return type(integrator).__name__ if name == "SamplingIntegrator" else name
 
 
-def _refusal(parameter: Parameter, splats: SplatsState) -> str | None:
+def _refusal(parameter: Parameter, splats: SplatsState, mode: dr.ADMode) -> str | None:
     nested, owner = splats.nested, parameter.owners[0]
     kind = SPLATPATH if nested is None else type_of(nested)
     is_of_emitter = any(isinstance(node, mi.Emitter) for node in parameter.owners)
@@ -153,6 +145,10 @@ def _refusal(parameter: Parameter, splats: SplatsState) -> str | None:
             return f"{kind} does not follow a lamp that moves; {TO_SPLATPATH}"
         if splats.lighting.light != "none" and not owner.is_environment():
             return "the shadows that splats throw move with it; set light to 'none'"
+    # Mitsuba renders a padded copy of an environment map's texels.
+    is_padded = (owner.class_name(), parameter.key) == ("EnvironmentMapEmitter", "data")
+    if mode == dr.ADMode.Forward and is_padded:
+        return "forward mode does not reach its texels; use dr.backward"
     return None
 
 

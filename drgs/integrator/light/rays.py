@@ -152,18 +152,6 @@ def _sensor_type(variant: str) -> type:
             self.m_needs_sample_3 = sensor.needs_sample_3()
 
         @override
-        def sample_ray(
-            self,
-            time: Float,
-            sample1: Float,
-            sample2: mi.Point2f,
-            sample3: mi.Point2f,
-            active: Bool | bool = True,
-        ) -> tuple[mi.Ray3f, mi.Spectrum]:
-            ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
-            return mi.Ray3f(ray), weight
-
-        @override
         def sample_ray_differential(
             self,
             time: Float,

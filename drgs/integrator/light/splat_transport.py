@@ -43,7 +43,7 @@ from drgs.core.arrays import reinterpret
 from drgs.core.errors import PluginError
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.film import decode
-from drgs.integrator.light.rays import PathSegment, SplatTransport, TransportIntegrator
+from drgs.integrator.light.rays import PathSegment, SplatTransport
 from drgs.integrator.sensors import SensorState, camera_from_sensor, read_sensor
 from drgs.integrator.state import SplatsState
 from drgs.light.probe import CUBE_SIZE_TEXELS, LOW_PASS, NUM_LEVELS, ProbeHit, Probes
@@ -141,20 +141,13 @@ def ray_splats_of(gaussians: Gaussians, approximations: Approximations, degree: 
     return RaySplats.from_gaussians(rows, degree, pipeline_of(approximations, degree).model.cutoffs)
 
 
-def nested_with_transport(
+def transport_of(
     splats: SplatsState, scene: mi.Scene, num_paths: int, sensors: Sequence[mi.Sensor]
-) -> mi.SamplingIntegrator:
-    """Return the nested integrator with its splats; num_paths: per pixel; sensors: rendered."""
-    nested: mi.SamplingIntegrator | None = splats.nested
-    if nested is None:
-        settings = {"type": "splatpath", "hide_emitters": splats.hide_emitters}
-        nested = mi.load_dict(settings)
-    assert isinstance(nested, TransportIntegrator), "checked with the settings"
+) -> SplatTransport:
+    """Return the transport of an integrator's light; num_paths: per pixel; sensors: rendered."""
     if splats.lighting.light == "rays":
-        nested.use_transport(RayTransport.from_splats(splats))
-    else:
-        nested.use_transport(ProbeTransport.from_splats(splats, scene, num_paths, sensors))
-    return nested
+        return RayTransport.from_splats(splats)
+    return ProbeTransport.from_splats(splats, scene, num_paths, sensors)
 
 
 def _segment(ray: mi.Ray3f, active: mi.Bool) -> Segment:
@@ -284,7 +277,9 @@ def _probes(
             from drgs.effects.smoothing import apply_smoothing
 
             pipeline = replace(pipeline, rows=apply_smoothing)
-        probes = Probes.render(gaussians, pipeline, centers, splats.near, _decode, planes)
+        probes = Probes.render(
+            gaussians, pipeline, centers, splats.near, mi.math.srgb_to_linear, planes
+        )
         _warn_of_close(splats, objects, flat, probes)
         return probes
 
@@ -398,7 +393,3 @@ def _over_black(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
     """Decode with black as the last splat: return D(C), given A D(C / A) and A."""
     display = mi.math.linear_to_srgb(color / dr.select(coverage > 0, coverage, 1))
     return mi.math.srgb_to_linear(coverage * display)
-
-
-def _decode(color: list[mi.Float]) -> list[mi.Float]:
-    return [mi.math.srgb_to_linear(channel) for channel in color]

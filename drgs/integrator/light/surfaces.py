@@ -264,25 +264,22 @@ class NestedSurfaces:
         cache, hide_emitters = splats.cache, splats.hide_emitters
         surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
         count = splats.nested_spp or spp
-        nested: mi.SamplingIntegrator
-        adjoint: mi.SamplingIntegrator
-        if splats.lighting.light != "none":
-            from drgs.integrator.light.splat_transport import nested_with_transport
+        is_lit = splats.lighting.light != "none"
+        # The same paths as ``path``, with correct derivatives for more parameters, and lamps seen
+        # through transparent surfaces.
+        default = {"type": "splatpath", "hide_emitters": hide_emitters}
+        nested: mi.SamplingIntegrator = splats.nested or mi.load_dict(default)
+        adjoint = nested
+        if splats.nested is None and not (is_lit or surfaces.is_transparent):
+            nested = mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
+        if isinstance(nested, TransportIntegrator):
+            transport = None  # another integrator may have given it one
+            if is_lit:
+                from drgs.integrator.light.splat_transport import transport_of
 
-            num_paths = count or sensor.sampler().sample_count()
-            nested = adjoint = nested_with_transport(splats, scene, num_paths, sensors_of(sensor))
-        else:
-            if splats.nested is not None:
-                nested = adjoint = splats.nested
-            else:
-                # The same paths as ``path``, with correct derivatives for more parameters, and
-                # lamps seen through transparent surfaces.
-                adjoint = mi.load_dict({"type": "splatpath", "hide_emitters": hide_emitters})
-                nested = adjoint
-                if not surfaces.is_transparent:
-                    nested = mi.load_dict({"type": "path", "hide_emitters": hide_emitters})
-            if isinstance(nested, TransportIntegrator):
-                nested.use_transport(None)  # another integrator may have given it one
+                num_paths = count or sensor.sampler().sample_count()
+                transport = transport_of(splats, scene, num_paths, sensors_of(sensor))
+            nested.use_transport(transport)
         compositor = SurfaceCompositor(
             sensor.film(),
             cache.film_maps,
@@ -371,13 +368,10 @@ class NestedSurfaces:
 
         Paths from behind windows have fewer bounces where ``max_depth`` can be set in Python.
         """
-        if not self.surfaces.is_transparent:
-            with _keep_sample_count(self.sensor):
-                yield self.sensor
-            return
         for count in range(self.compositor.num_surfaces):
-            behind = RaysBehind(self.rays, count)
-            sensor = sensor_behind(self.sensor, sensors_of(self.sensor), behind)
+            sensor = self.sensor
+            if self.surfaces.is_transparent:
+                sensor = sensor_behind(sensor, sensors_of(sensor), RaysBehind(self.rays, count))
             with (
                 _keep_sample_count(self.sensor),
                 _reduce_depth(self.integrator, count),
@@ -388,7 +382,7 @@ class NestedSurfaces:
     @contextmanager
     def _differentiating(self) -> Iterator[list[Parameter]]:
         """Yield the attached parameters of the surfaces; errors are raised with their names."""
-        with dr.resume_grad(), _keep_sample_count(self.sensor):
+        with dr.resume_grad():
             parameters = list(attached_parameters(self.rays.scene))
             try:
                 yield parameters

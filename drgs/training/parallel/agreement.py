@@ -20,7 +20,7 @@ import drgs
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.core.errors import UserError, format_names
 from drgs.core.private import llvm_vector_width, llvm_version
-from drgs.integrator.types import SplatsPlugin
+from drgs.integrator.state import SplatsPlugin
 from drgs.training.parallel.communicator import Communicator
 
 

@@ -29,8 +29,7 @@ from drgs.integrator.sensors import (
     camera_from_sensor,
     read_sensor,
 )
-from drgs.integrator.state import ProjectedView
-from drgs.integrator.types import SplatsPlugin
+from drgs.integrator.state import ProjectedView, SplatsPlugin
 from drgs.splatting.rasterize import SplatGradients
 from drgs.splatting.rendering import (
     CameraGradients,
@@ -223,8 +222,8 @@ class SeveralViews:
         with dr.suspend_grad():
             gaussians, by_time, of_cameras = dr.detach(self.integrator.gaussians), [], []
             for local, gradients in zip(each.local, each.gradients, strict=True):
-                inputs = local.camera, local.pipeline, gradients
-                of_time, of_rows = gradients_by_row(gaussians, *inputs, with_camera=True)
+                given = CameraGradients(local.camera, local.pipeline, gradients)
+                of_time, of_rows = gradients_by_row(gaussians, given, with_camera=True)
                 by_time.append(of_time)
                 rows = np.stack([np.array(column) for column in of_rows], axis=1)
                 rows = self.comm.gather_rows(rows, each.renderer)
