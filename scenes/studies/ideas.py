@@ -444,16 +444,16 @@ class EverySecondAtHalfSize(Change):
 
     @override
     def attach(self, trainer: Trainer) -> None:
-        coarse, full = trainer.stages
+        coarse, full = trainer.phases
         plan, end = trainer.plan, 0.7 * trainer.config.iterations
-        trainer.stages = [_Kept(**vars(stage)) for stage in (coarse, full)]
-        coarse, full = trainer.stages
+        trainer.phases = [_Kept(**vars(phase)) for phase in (coarse, full)]
+        coarse, full = trainer.phases
 
         def alternating(iteration: int) -> object:
             step = plan(iteration)
-            stage = coarse if iteration % 2 == 1 and iteration < end else full
-            views = tuple(replace(v, view=stage.views[v.view.index]) for v in step.views)
-            return replace(step, stage=stage, views=views)
+            phase = coarse if iteration % 2 == 1 and iteration < end else full
+            views = tuple(replace(v, view=phase.views[v.view.index]) for v in step.views)
+            return replace(step, phase=phase, views=views)
 
         trainer.plan = alternating  # type: ignore[method-assign]
         replace_strategy(trainer, GrowthToNumber)
