@@ -113,9 +113,9 @@ def run_command(
     with the whole line as ``command``, and ``is_shared`` if several processes may run it together.
     prog: the command's name. arguments: its words; None: those of this process.
     """
+    escape_unencodable()
     with (
         end_job_on_error(),
-        escape_unencodable(),
         exit_on_interrupt(),
         exit_on_user_error(),
         root_output_only(),

@@ -16,8 +16,13 @@ from typing_extensions import override
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.datasets.notices import Notices
-from drgs.datasets.reader import DatasetReader, Intrinsics, describe_extras, load_views
+from drgs.datasets.reader import (
+    DatasetReader,
+    Intrinsics,
+    Notices,
+    describe_extras,
+    load_views,
+)
 from drgs.datasets.transforms import (
     TransformsFrame,
     focal_from_angle,

@@ -7,9 +7,12 @@ folder.
 
 from __future__ import annotations
 
+import os
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -19,7 +22,8 @@ from pydantic import BaseModel
 from drgs.cameras.viewpoints import panorama_intrinsics
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, UserNote, format_names, one_line
+from drgs.core.folders import digest
 from drgs.datasets.images import (
     Pixels,
     can_shift,
@@ -36,7 +40,6 @@ from drgs.datasets.images import (
     read_mask,
     unread_image,
 )
-from drgs.datasets.notices import Notices
 from drgs.datasets.splits import Lists, split_of
 from drgs.datasets.storage import MemoryStore
 from drgs.datasets.transforms import (
@@ -50,7 +53,7 @@ from drgs.datasets.transforms import (
     unique_names,
 )
 from drgs.datasets.types import Dataset, View, ViewFilter, all_views
-from drgs.io.images import read_header, read_pixels, upright
+from drgs.io.images import colour_profile, read_header, read_pixels, upright
 
 if TYPE_CHECKING:
     from drgs.cameras.lens import Lens
@@ -62,6 +65,8 @@ MAX_WIDTH = 1600
 
 DEPTH_IMAGE_UNIT = 1e-3
 """Scene units in a step of a depth image without ``depth_unit_scale_factor``, as in nerfstudio."""
+
+MAX_NOTE_CHARACTERS = 1000
 
 T = TypeVar("T")
 
@@ -340,3 +345,62 @@ def describe_extras(
     if "motion" in ignored:
         text += f"; motion ({CLOSE_POSE_KEY}) ignored"
     return ignored, text
+
+
+# Notes for the user on the photographs
+
+
+class Notices:
+    """Collects findings while photographs are read, on several threads."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._findings: dict[str, list[str]] = {}  # names of photographs
+
+    def inspect(self, file: Path, pixels: np.ndarray) -> None:
+        """Record findings on a photograph; pixels: (H, W, C), as they were read."""
+        findings = []
+        if profile := colour_profile(file):
+            findings.append(f"with the colour profile {profile}, which is not applied")
+        if pixels.shape[2] == 4 and not pixels[:, :, 3].any():
+            findings.append("that are transparent everywhere")
+        for finding in findings:
+            self._findings.setdefault(finding, []).append(self._name(file))
+
+    def emit(self, notes: Sequence[str], train: Sequence[View], test: Sequence[View]) -> None:
+        """Emit ``notes`` and the findings, each as a :class:`UserNote`."""
+        texts = [f"photographs {what}: {_format_files(n)}" for what, n in self._findings.items()]
+        texts += self._duplicate_notes(train, test)
+        for note in (*notes, *(f"{self._folder}: {text}" for text in texts)):
+            warnings.warn(UserNote(one_line(note, MAX_NOTE_CHARACTERS)), stacklevel=2)
+
+    def _name(self, file: Path) -> str:
+        is_below = file.is_relative_to(self._folder)
+        return str(file.relative_to(self._folder) if is_below else file)
+
+    def _duplicate_notes(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
+        """Return a note on duplicate photographs, or none."""
+        groups = [[*train, *test]]
+        for key in (os.path.getsize, digest):
+            groups = [part for group in groups for part in _group_duplicates(group, cache(key))]
+        if not groups:
+            return []
+        pairs = [" = ".join(self._name(v.files["image"]) for v in group) for group in groups]
+        note = f"the same photograph more than once: {_format_files(pairs)}"
+        in_train, in_test = ({view.files["image"] for view in views} for views in (train, test))
+        files = [{view.files["image"] for view in group} for group in groups]
+        both = sum(bool(group & in_train and group & in_test) for group in files)
+        return [note + (f"; {both:,} of them both trained and measured on" if both else "")]
+
+
+def _format_files(names: Sequence[str]) -> str:
+    ordered = sorted(names)
+    return f"{len(ordered):,} ({format_names(ordered)})"
+
+
+def _group_duplicates(views: Sequence[View], key: Callable[[Path], object]) -> list[list[View]]:
+    """Return groups of several views whose photographs have the same key."""
+    groups: dict[object, list[View]] = {}
+    for view in views:
+        groups.setdefault(key(view.files["image"]), []).append(view)
+    return [group for group in groups.values() if len(group) > 1]

@@ -139,9 +139,7 @@ class LiveScene:
         return scene
 
 
-# ----------------------------------------------------------------------------------------------
 # Frame contents
-# ----------------------------------------------------------------------------------------------
 
 
 def _color(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
@@ -211,9 +209,7 @@ def over_backdrop(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return to_bytes(alpha * colors + (1 - alpha) * BACKDROP_GRAY)
 
 
-# ----------------------------------------------------------------------------------------------
 # Lenses
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
