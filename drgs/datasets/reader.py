@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from pydantic import BaseModel
@@ -54,9 +54,6 @@ from drgs.datasets.transforms import (
 )
 from drgs.datasets.types import Dataset, View, ViewFilter, all_views
 from drgs.io.images import colour_profile, read_header, read_pixels, upright
-
-if TYPE_CHECKING:
-    from drgs.cameras.lens import Lens
 
 __all__ = ["READERS", "DatasetReader", "Photographs", "TransformsFrame"]
 
@@ -167,7 +164,6 @@ def load_views(
 
     def load(frame: TransformsFrame, name: str) -> View:
         file, is_read = frame.files["image"], keeps(name)
-
         pixels = read_pixels(file) if is_read else placeholder_pixels(file)
         pixels = orient_as_calibrated(pixels, frame)
         if is_read:
@@ -175,17 +171,16 @@ def load_views(
         height, width = pixels.shape[:2]
         size = downscaled_size(width, height, config.image_size)
         camera = intrinsics(frame, pixels.shape, size)  # first: raises for a wrong size
-        image, alpha, mask, depth = (
-            _read_images(config, frame, pixels, store)
-            if is_read
-            else _unread_images(frame, pixels, size)
-        )
+        read = _read_images(config, frame, pixels, store) if is_read else None
+        image, alpha, mask, depth = read or _unread_images(frame, pixels, size)
+        if (lens := lens_of(frame)) is not None and lens.distorts and config.ignore_distortion:
+            lens = None
         return View(
             name,
             frame.values.transform_matrix,
             *camera,
             *size,
-            lens=rendered_lens(config, frame),
+            lens=lens,
             motion=None if config.ignore_motion else motion_of(frame, config.shutter_samples),
             image=image,
             alpha=alpha,
@@ -246,15 +241,13 @@ def _intrinsics(
     fx = _focal(frame, "x", width)
     has_fy = values.fl_y is not None or values.camera_angle_y is not None
     fy = _focal(frame, "y", height) if has_fy else fx
-    cx, cy = (_principal(frame, key, side) for key, side in (("cx", width), ("cy", height)))
+    cx, cy = width / 2, height / 2
+    if values.cx is not None:
+        cx = principal_point(values.cx, frame.location("cx"), width)
+    if values.cy is not None:
+        cy = principal_point(values.cy, frame.location("cy"), height)
     x, y = size[0] / width, size[1] / height
     return fx * x, fy * y, cx * x, cy * y
-
-
-def rendered_lens(config: DataConfig, frame: TransformsFrame) -> Lens | None:
-    """Return the frame's lens; None for a pinhole, and for one whose distortion is ignored."""
-    lens = lens_of(frame)
-    return None if lens is not None and lens.distorts and config.ignore_distortion else lens
 
 
 def _focal(frame: TransformsFrame, axis: str, side: int) -> float:
@@ -266,11 +259,6 @@ def _focal(frame: TransformsFrame, axis: str, side: int) -> float:
     raise UserError(
         f"{frame.location(f'fl_{axis}')} is missing, and there is no camera_angle_{axis} either"
     )
-
-
-def _principal(frame: TransformsFrame, key: str, side: int) -> float:
-    value = getattr(frame.values, key)
-    return side / 2 if value is None else principal_point(value, frame.location(key), side)
 
 
 # Images, masks and depths of a frame
