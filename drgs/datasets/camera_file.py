@@ -28,8 +28,6 @@ def read_viewpoints(
 
     size: width and height, px; None for the file's. ``fl_x`` and ``cx`` are px of the file's ``w``,
     ``fl_y`` and ``cy`` of its ``h``. shutter_samples: times at which motion blur is rendered.
-
-    Raises :class:`UserError` as :func:`read_transforms`.
     """
     meta = read_transforms(path)
     if meta.unread:

@@ -329,8 +329,6 @@ def choose_store(
     """Return the store for photographs: memory, or a disk where they do not fit.
 
     in_memory: None: if they take less than half of what is available.
-
-    Raises :class:`UserError` if the stored photographs do not fit into memory, or on the disk.
     """
     needed = 0  # bytes
     for file in files:

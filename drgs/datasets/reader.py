@@ -109,38 +109,48 @@ class DatasetReader:
         frames = sorted(photographs.frames, key=lambda frame: frame.file_path)
         names = [frame.file_path for frame in frames]
         split = split_of(config, photographs.source, photographs.lists, names, photographs.notes)
-        changes: dict[str, object] = {}
+        changes: dict[str, object] = {"image_size": config.image_size or MAX_WIDTH}
         if config.background is None:
             is_any_transparent = any(read_header(f.files["image"]).has_alpha for f in frames)
             changes["background"] = "white" if is_any_transparent else "black"
-        if config.image_size is None:
-            changes["image_size"] = MAX_WIDTH
         config, notices = config.model_copy(update=changes), Notices(config.path)
         used = sorted({*split.train, *split.test})
         views = load_views(config, [frames[i] for i in used], _intrinsics, keeps, notices)
         views = dict(zip(used, views, strict=True))
         train, test = (tuple(views[i] for i in indices) for indices in (split.train, split.test))
-        measured = () if split.name == "train" else test
-        notices.emit(photographs.notes, train, measured)
-        ignored, extras = describe_extras(config, frames)
-        return Dataset(
-            train=train,
-            test=test,
-            test_split=split.name,
-            background=config.background_rgb,
-            start_half_extent=None,
-            description=(
-                f"{config.path.name} ({photographs.layout} layout): {len(train)} train views, "
-                f"measured on {len(test)} views ({split.how}), {train[0].width}x{train[0].height}, "
-                f"background {config.background}{extras}{photographs.note}"
-            ),
-            ignored=ignored,
-            point_cloud=photographs.point_cloud,
-        )
+        return make_dataset(config, photographs, train, test, split.name, f"({split.how})", notices)
 
     def image_files(self, config: DataConfig) -> Sequence[Path]:
         """Return the files of the photographs, from whose sizes a configuration is chosen."""
         return [frame.files["image"] for frame in self.photographs(config).frames]
+
+
+def make_dataset(
+    config: DataConfig,
+    photographs: Photographs,
+    train: tuple[View, ...],
+    test: tuple[View, ...],
+    test_split: str,
+    how: str,
+    notices: Notices,
+) -> Dataset:
+    """Return a dataset of loaded views, and emit the notes on it; how: test views were chosen."""
+    notices.emit(photographs.notes, train, () if test_split == "train" else test)
+    ignored, extras = describe_extras(config, photographs.frames)
+    return Dataset(
+        train=train,
+        test=test,
+        test_split=test_split,
+        background=config.background_rgb,
+        start_half_extent=None,
+        description=(
+            f"{config.path.name} ({photographs.layout} layout): {len(train)} train views, "
+            f"measured on {len(test)} views {how}, {train[0].width}x{train[0].height}, "
+            f"background {config.background}{extras}{photographs.note}"
+        ),
+        ignored=ignored,
+        point_cloud=photographs.point_cloud,
+    )
 
 
 def load_views(
@@ -153,9 +163,6 @@ def load_views(
     """Return the views of frames; images that ``keeps`` does not accept by name are not read.
 
     intrinsics: takes a frame, the shape of its photograph (H, W, C) and the size W, H of the view.
-
-    Raises :class:`UserError` for images that do not fit into memory or on a disk, and for those
-    that cannot be read.
     """
     names = unique_names([frame.file_path for frame in frames])
     files = [frame.files["image"] for frame in frames]

@@ -23,10 +23,6 @@ from drgs.core.files import refusal_reason
 from drgs.core.memory import format_bytes
 from drgs.datasets.types import LazyImage, Pixels, View
 
-LARGER_DISK = (
-    "set TMPDIR to a folder of a larger disk or a smaller data.image_size, or use fewer of them"
-)
-
 
 class MemoryStore:
     """Keeps pixels in memory."""
@@ -57,7 +53,8 @@ class DiskStore(MemoryStore):
                 raise UserError(
                     f"{self._folder}: {num_photographs:,} photographs take "
                     f"{format_bytes(num_bytes)} there during the fit, and {format_bytes(free)} are "
-                    f"free; {LARGER_DISK}"
+                    "free; set TMPDIR to a folder of a larger disk or a smaller data.image_size, "
+                    "or use fewer of them"
                 )
             self._file = tempfile.TemporaryFile(dir=self._folder, prefix="drgs")  # noqa: SIM115
         except OSError as error:

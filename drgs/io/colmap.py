@@ -124,11 +124,7 @@ def model_files(folder: Path) -> dict[str, Path] | None:
 
 
 def read_model(folder: str | Path) -> ColmapModel:
-    """Return the model in ``folder``, without its points.
-
-    Raises :class:`UserError` naming the file, the byte or line, the expected and the actual
-    value.
-    """
+    """Return the model in ``folder``, without its points."""
     files = model_files(Path(folder))
     if files is None:
         raise UserError(

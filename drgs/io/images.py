@@ -43,7 +43,6 @@ MAX_16_BITS = 2**16 - 1
 MITSUBA_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA")
 """Pillow's names of the formats that Mitsuba reads as well. MPO is a JPEG with several images."""
 
-
 FIRST_TRANSPOSED_ORIENTATION = 5  # EXIF's orientations from this one exchange width and height
 
 INVERSE_ORIENTATIONS = {6: 8, 8: 6}  # other orientations are their own inverses
@@ -151,8 +150,6 @@ def read_pixels(path: Path) -> np.ndarray:
     """Return (H, W, C) as stored (EXIF orientation is not applied), uint8 or 16 bits in an integer.
 
     C is 3, or 4 with straight (not premultiplied) alpha; grey images become RGB.
-
-    Raises :class:`UserError` for any other file.
     """
     with _open_image(path) as image:
         needed = image.width * image.height * PIXEL_BYTES

@@ -164,10 +164,7 @@ def encode_elements(
 
 
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None.
-
-    Raises :class:`UserError` as :func:`read_elements`.
-    """
+    """Return positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None."""
     rows, statements = read_elements(path, ["vertex"])
     vertex = rows["vertex"]
     _require(path, vertex, POSITION, "points")
@@ -186,10 +183,7 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def has_packed_vertices(path: str | Path) -> bool:
-    """Return whether a PLY file is one of :mod:`drgs.io.compressed_ply`.
-
-    Raises :class:`UserError` for an invalid header.
-    """
+    """Return whether a PLY file is one of :mod:`drgs.io.compressed_ply`."""
     with _open_after_header(path) as (_, header):
         names = [p.name for each in header.elements for p in each.properties]
         return "chunk" in header.counts and "packed_position" in names
