@@ -4,23 +4,32 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from types import ModuleType
 
 from typing_extensions import override
 
 import drgs
 from drgs.cli.commands import CommandParser, Subcommand, run_command
 from drgs.core.environment import describe_installation
+from drgs.core.registry import modules_of
 
-COMMANDS = {
-    "fit": Subcommand("fit 3D Gaussians to posed photographs", "drgs.fit.__main__"),
-    "examine": Subcommand("find out which effects photographs call for", "drgs.examine.__main__"),
-    "poses": Subcommand("find out where photographs were taken", "drgs.poses.__main__"),
-    "render": Subcommand("render Gaussians, a fit, or a Mitsuba scene", "drgs.render.__main__"),
-    "export": Subcommand("write Gaussians for other programs", "drgs.export.__main__"),
-    "view": Subcommand("look at Gaussians in a browser, rendered live", "drgs.view.__main__"),
-    "capture": Subcommand("turn a Mitsuba scene into a training set", "drgs.capture.__main__"),
-    "bench": Subcommand("measure drgs; write tables and plots", "drgs.bench.__main__"),
-}
+GROUP = "drgs.commands"
+"""Of entry points: the value is a package, whose ``__main__`` has ``add_arguments``."""
+
+
+def commands() -> dict[str, Subcommand]:
+    """Return the commands by name, shipped ones first."""
+    packages = modules_of(GROUP)
+    return {
+        name: Subcommand(_describe(package), f"{package.__name__}.__main__")
+        for name, package in packages.items()
+    }
+
+
+def _describe(package: ModuleType) -> str:
+    """Return the first line of a package's documentation as a phrase."""
+    first = (package.__doc__ or package.__name__).strip().splitlines()[0].removesuffix(".")
+    return f"{first[0].lower()}{first[1:]}"
 
 
 def main(arguments: Sequence[str] | None = None, prog: str = "drgs") -> None:
@@ -42,7 +51,7 @@ def add_arguments(parser: CommandParser) -> None:
         nargs=0,
         help="show the versions of drgs and of what it runs on, for a report, and exit",
     )
-    parser.add_commands(COMMANDS, metavar="COMMAND")
+    parser.add_commands(commands(), metavar="COMMAND")
 
 
 class ShowVersion(argparse.Action):

@@ -9,7 +9,7 @@ from drgs.training.losses import LossTerm
 
 
 class BinaryOpacitySection(Section):
-    """The section ``extensions.binary_opacity``."""
+    """The section ``binary_opacity``."""
 
     weight: float = Field(0.01, ge=0, description="Weight of the mean of o (1 - o).")
 

@@ -9,7 +9,7 @@ from drgs.training.losses import Loss
 
 
 class CharbonnierSection(Section):
-    """The section ``extensions.charbonnier``."""
+    """The section ``charbonnier``."""
 
     epsilon: float = Field(0.01, gt=0, description="Differences below this count as squares.")
 

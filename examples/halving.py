@@ -11,7 +11,7 @@ from drgs.training.density.strategy import DensityReport, DensityStrategy
 
 
 class HalvingSection(Section):
-    """The section ``extensions.halving``."""
+    """The section ``densify.halving``."""
 
     after: int = Field(10, ge=1, description="The iteration after which half are removed.")
 

@@ -11,7 +11,7 @@ from drgs.datasets.reader import READERS, DatasetReader, Photographs, Transforms
 
 
 class NumpyPosesSection(Section):
-    """The section ``extensions.numpy_poses``."""
+    """The section ``numpy_poses``."""
 
     unit: float = Field(1.0, gt=0, description="Scene units of a unit in poses.npy.")
 

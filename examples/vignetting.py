@@ -7,12 +7,12 @@ from pydantic import Field
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.section import Section
-from drgs.training.effects.base import as_tensor
-from drgs.training.effects.view_parameters import OptimisedEffect
+from drgs.effects.base import as_tensor
+from drgs.effects.optimised import OptimisedEffect
 
 
 class VignettingSection(Section):
-    """The section ``extensions.vignetting``."""
+    """The section ``vignetting``."""
 
     lr: float = Field(0.01, gt=0, description="First rate of the strength; falls as the means'.")
 
@@ -20,8 +20,6 @@ class VignettingSection(Section):
 @EFFECTS.register("vignetting", section=VignettingSection)
 class Vignetting(OptimisedEffect):
     """Renderings are darkened towards the corners, as the photographs are."""
-
-    name = "vignetting"
 
     def __init__(self, section: VignettingSection) -> None:
         strength = {"strength": np.zeros((1, 1))}  # one for all views

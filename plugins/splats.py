@@ -23,8 +23,7 @@ from drgs.core.types import Bool
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.image_render import ImageRender
 from drgs.integrator.properties import check_object, nested_integrators, read_state
-from drgs.integrator.state import BackwardResult, surfaces_in
-from drgs.splatting.rendering import ProjectionStage
+from drgs.integrator.state import BackwardResult, ProjectedView, surfaces_in
 
 
 def _setting(name: str, doc: str) -> property:
@@ -213,9 +212,15 @@ class SplatsIntegrator(mi.CppADIntegrator):
     near = property(attrgetter("state.near"), doc="Near plane, scene units.")
     ignore = property(attrgetter("state.ignore"), doc="Effects that are not simulated.")
 
-    def use_projection(self, stage: ProjectionStage) -> None:
-        """Project the Gaussians by another stage, such as one across several processes."""
-        self.state.projection = stage
+    @property
+    def projected_view(self) -> ProjectedView | None:
+        """Splats that are rendered instead of the Gaussians, by one sensor. May be set."""
+        return self.state.projected_view
+
+    @projected_view.setter
+    def projected_view(self, view: ProjectedView | None) -> None:
+        self.forget_frames()
+        self.state.projected_view = view
 
     @override
     def aov_names(self) -> list[str]:
@@ -254,15 +259,17 @@ class SplatsIntegrator(mi.CppADIntegrator):
     ) -> None:
         """Accumulate derivatives into parameters; leave a ``BackwardResult`` in ``last``."""
         with self._rendering(scene, sensor, seed, spp, dr.ADMode.Backward) as render:
-            gradients = render.backward(params, grad_in)
-            means2d, frames = gradients.means2d, self.state.cache.kept["frames 0"].value
-            self.last = BackwardResult(
-                mi.TensorXf(interleave(list(means2d)), (dr.width(means2d), 2)),
-                gradients.visible,
-                gradients.first_nonfinite,
-                [frame for of_time in frames for frame in of_time],
-            )
-            if gradients.parameters is not None:
+            if self.projected_view is not None:
+                render.splats_backward(self.projected_view, grad_in)
+            else:
+                gradients = render.backward(params, grad_in)
+                means2d, frames = gradients.means2d, self.state.cache.kept["frames 0"].value
+                self.last = BackwardResult(
+                    mi.TensorXf(interleave(list(means2d)), (dr.width(means2d), 2)),
+                    gradients.visible,
+                    gradients.first_nonfinite,
+                    [frame for of_time in frames for frame in of_time],
+                )
                 with dr.resume_grad():
                     self.state.accumulate(scene, gradients.parameters)
 

@@ -66,8 +66,8 @@ class Copies:
         self.chain = Instrumented(
             board,
             rendering,
-            derivatives=["frames_adjoint", "frames_tangent", "DirectProjection.gradients"],
-            forward=["render", "Frame.planes", "DirectProjection.project"],
+            derivatives=["frames_adjoint", "splats_adjoint", "frames_tangent"],
+            forward=["render", "Frame.planes"],
         )
         self.model = Instrumented(
             board,
@@ -144,10 +144,6 @@ class Copies:
             patch.setattr(rendering, name, self.chain[name])
         for name in STAGES:
             patch.setattr(order, name, self.stage(name))
-        # Frames of the forward pass, which is not the copy's, go back through this.
-        patch.setattr(
-            rendering.DirectProjection, "gradients", self.chain["DirectProjection"].gradients
-        )
         patch.setattr(footprint, "GaussianFalloff", self.model["GaussianFalloff"])
         patch.setattr(special_checks, "Alpha", self.model["Alpha"])
         patch.setattr(special_checks, "composite_step", self.kernels["composite_step"])

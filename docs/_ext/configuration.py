@@ -9,10 +9,12 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from docutils import nodes
+from pydantic import BaseModel
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from drgs.config.schema import FitConfig
+from drgs.config.section import ExtensibleSection
 from drgs.core.constants import MAX_INT
 
 COLUMNS = {"key": 20, "type": 22, "default": 10, "description": 48}  # widths, per cent
@@ -32,17 +34,19 @@ class ConfigurationTables(SphinxDirective):
 
 def make_sections() -> list[nodes.Node]:
     """Return the sections of the whole configuration, in the order of the schema."""
-    schema = FitConfig.model_json_schema()
-    return list(_sections("", schema, schema["$defs"]))
+    return list(_sections("", FitConfig))
 
 
-def _sections(path: str, schema: dict[str, Any], models: dict[str, Any]) -> Iterator[nodes.section]:
+def _sections(path: str, model: type[BaseModel]) -> Iterator[nodes.section]:
     """Yield a section for the keys of a model, and then for each model among them."""
-    inner, rows = {}, []
+    schema = model.model_json_schema()
+    models, rows = schema.get("$defs", {}), []
+    inner = {name: field.annotation for name, field in model.model_fields.items()}
+    inner = {name: kind for name, kind in inner.items() if _is_model(kind)}
+    if issubclass(model, ExtensibleSection):
+        inner |= {each.name: each.section for each in model.extensions() if each.is_shipped}
     for name, field in schema["properties"].items():
-        if "$ref" in field:
-            inner[name] = _model(field, models)
-        else:
+        if name not in inner:
             default = "required" if name in schema.get("required", ()) else _default(field)
             rows.append([name, _type(field, models), default, field["description"]])
     title = nodes.title("", "", nodes.literal("", path) if path else nodes.Text("Top level"))
@@ -50,8 +54,12 @@ def _sections(path: str, schema: dict[str, Any], models: dict[str, Any]) -> Iter
     section += [title, nodes.paragraph("", "", *_inline(schema["description"].split("\n\n")[0]))]
     section += _table(rows)
     yield section
-    for name, model in inner.items():
-        yield from _sections(f"{path}.{name}".lstrip("."), model, models)
+    for name, section in inner.items():
+        yield from _sections(f"{path}.{name}".lstrip("."), section)
+
+
+def _is_model(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
 def _table(rows: list[list[str]]) -> nodes.table:

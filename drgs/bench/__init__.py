@@ -1,4 +1,6 @@
-"""Measurements shown in the documents, each a command: ``drgs bench NAME``.
+"""Measure drgs; write tables and plots.
+
+Each measurement shown in the documents is a command, ``drgs bench NAME``.
 
 May import everything.
 """

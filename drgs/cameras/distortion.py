@@ -210,8 +210,8 @@ def steepest_fall(tangential: Sequence[float], prism: Sequence[float] = ()) -> f
 
     That is of the symmetric part of their Jacobian, in any direction. tangential: p1, p2 or none;
     prism: sx1, sy1 or none, of terms sx1 r^2 in x' and sy1 r^2 in y'. At w = (x, y), with
-    p = (p2, p1) and s = (sx1, sy1), all of them are r^2 (p + s) + 2 (p . w) w, the symmetric part is
-    q w^T + w q^T + 2 (p . w) I with q = 2 p + s, and its least eigenvalue (4 p + s) . w - r |q|.
+    p = (p2, p1) and s = (sx1, sy1), all of them are r^2 (p + s) + 2 (p . w) w, the symmetric part
+    is q w^T + w q^T + 2 (p . w) I with q = 2 p + s, its least eigenvalue (4 p + s) . w - r |q|.
     """
     p, s = (np.array(pair or (0.0, 0.0)) for pair in (tangential[::-1], prism))
     return math.hypot(*(4 * p + s)) + math.hypot(*(2 * p + s))

@@ -25,16 +25,7 @@ from drgs.core.errors import UserError
 from drgs.core.registry import ClassRegistry
 from drgs.core.types import Array2f, Array3f, Bool, Float, Matrix3f, Scalar, UInt32
 
-LENSES: ClassRegistry[Lens] = ClassRegistry(
-    "lens",
-    {
-        "pinhole": "drgs.cameras.lens",
-        "opencv": "drgs.cameras.radial_tangential",
-        "fisheye": "drgs.cameras.fisheye",
-        "thin_prism_fisheye": "drgs.cameras.thin_prism_fisheye",
-        "equirectangular": "drgs.cameras.equirectangular",
-    },
-)
+LENSES: ClassRegistry[Lens] = ClassRegistry("lens", "drgs.lenses")
 """Lenses by name."""
 
 NEWTON_STEPS = 24

@@ -1,4 +1,4 @@
-"""``drgs capture``: path-traced images of a Mitsuba scene as a dataset.
+"""Turn a Mitsuba scene into a training set.
 
 May import the packages that commands may import.
 """

@@ -55,22 +55,13 @@ class Limits:
         return {k: v for k, v in given.items() if v is not None and math.isfinite(v)}
 
 
-PROJECTIONS = ClassRegistry(
-    "projection",
-    {
-        "ewa": "drgs.splatting.projection",
-        "unscented": "drgs.accuracy.unscented",
-        "exact": "drgs.accuracy.exact",
-    },
-)
+PROJECTIONS = ClassRegistry("projection", "drgs.projections")
 """Subclasses of ``drgs.splatting.projection.ProjectionModel``."""
 
-FALLOFFS = ClassRegistry("falloff", {"gaussian": "drgs.splatting.footprint"})
+FALLOFFS = ClassRegistry("falloff", "drgs.falloffs")
 """Subclasses of ``drgs.splatting.footprint.GaussianFalloff``."""
 
-ORDERS = ClassRegistry(
-    "order", {"center": "drgs.splatting.order", "pixel": "drgs.accuracy.pixel_order"}
-)
+ORDERS = ClassRegistry("order", "drgs.orders")
 """Subclasses of ``drgs.splatting.order.CenterOrder``."""
 
 

@@ -13,17 +13,6 @@ from typing import Any
 from drgs.config.schema import FitConfig
 from drgs.config.section import Section
 
-_COUNTS = (
-    "densify.start",
-    "densify.stop",
-    "densify.adc.reset_every",
-    "densify.adc.white_background_reset",
-    "densify.prune.start",
-    "densify.prune.stop",
-    "model.sh_increase_every",
-    "cameras.start",
-)
-
 
 def with_changes(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
     """Set values by names such as ``densify.every``, and check the result."""
@@ -32,6 +21,8 @@ def with_changes(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
         *sections, name = key.split(".")
         target = values
         for section in sections:
+            if target.get(section) is None:
+                target[section] = {}
             target = target[section]
         target[name] = value
     return FitConfig.model_validate(values)
@@ -40,18 +31,18 @@ def with_changes(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
 def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     """Change the number of iterations, and everything else in proportion.
 
-    ``densify.every`` stays, as statistics are gathered over views. Revisions of the means' rate and
-    of growth are dropped.
+    ``densify.every`` stays, as statistics are gathered over views.
     """
     share = iterations / config.iterations
 
     def scale_count(count: int) -> int:
         return max(1, round(count * share)) if count else 0  # 0: from the start
 
-    changes: dict[str, Any] = {"iterations": iterations}
-    for key in _COUNTS:
-        count = _value(config, key)
-        changes[key] = count if count is None else scale_count(count)
+    changes: dict[str, Any] = {"iterations": iterations, "stop_after": None}
+    for prefix, section in _sections(config):
+        for name in section.scaled:
+            count = getattr(section, name)
+            changes[f"{prefix}{name}"] = count if count is None else scale_count(count)
     if config.coarse is not None:
         ends = {scale_count(stage.until): stage.factor for stage in reversed(config.coarse)}
         changes["coarse"] = [{"until": k, "factor": ends[k]} for k in sorted(ends)]
@@ -59,22 +50,18 @@ def with_iterations(config: FitConfig, iterations: int) -> FitConfig:
     if changes["densify.prune.stop"] is not None:
         least = max(changes["densify.stop"], changes["densify.prune.start"] or 0) + 1
         changes["densify.prune.stop"] = max(changes["densify.prune.stop"], least)
-    changes["optimizer.means_lr_aims"] = changes["densify.stop_aims"] = []
     return with_changes(config, changes)
 
 
 OPEN = ("data.background", "model.near")
 """Values that depend on the dataset if they are null: see ``drgs.initialization.defaults``."""
 
-OPEN_AT_START = (
-    *OPEN,
-    "init.num_points",
-    "densify.budget.gaussians",
-    "densify.mcmc.gaussians",
-    "optimizer.scales_lr",
-    "coarse",
-)
-"""The same, with those that only a fit needs."""
+
+def open_at_start(config: FitConfig) -> list[str]:
+    """Return the same, with those that only a fit needs."""
+    densify = config.densify
+    goal = [f"densify.{densify.strategy}.gaussians"] if densify.has_goal else []
+    return [*OPEN, "init.num_points", "optimizer.scales_lr", "coarse", *goal]
 
 
 def is_open(config: FitConfig) -> bool:
@@ -84,12 +71,12 @@ def is_open(config: FitConfig) -> bool:
 
 def with_decisions(config: FitConfig, other: FitConfig) -> FitConfig:
     """Set the values that ``config`` leaves to the dataset to those of ``other``."""
-    changes = {key: _value(other, key) for key in OPEN_AT_START if _value(config, key) is None}
-    return with_changes(config, changes)
+    open_keys = (key for key in open_at_start(config) if _value(config, key) is None)
+    return with_changes(config, {key: _value(other, key) for key in open_keys})
 
 
 def _value(config: FitConfig, key: str) -> Any:
-    return reduce(getattr, key.split("."), config)
+    return reduce(lambda section, name: getattr(section, name, None), key.split("."), config)
 
 
 def given_keys(config: FitConfig) -> set[str]:
@@ -98,15 +85,16 @@ def given_keys(config: FitConfig) -> set[str]:
     A null counts, unless it leaves the value to the dataset. Of a configuration that was loaded
     with all values, as a fit writes it, all are set.
     """
-    keys = {f"extensions.{name}" for name in config.extensions} | set(_set_keys(config, ""))
-    values = {key: reduce(getattr, key.split("."), config) for key in OPEN_AT_START}
-    return keys - {key for key, value in values.items() if value is None}
+    keys = {f"{p}{n}" for p, section in _sections(config) for n in section.model_fields_set}
+    left = {key for key in open_at_start(config) if _value(config, key) is None}
+    empty = config.sections.keys() - {key.partition(".")[0] for key in keys if "." in key}
+    sections = {prefix.removesuffix(".") for prefix, _ in _sections(config)}
+    return keys - left - (sections - empty)
 
 
-def _set_keys(section: Section, prefix: str) -> Iterator[str]:
-    for name in section.model_fields_set:
-        value = getattr(section, name)
+def _sections(section: Section, prefix: str = "") -> Iterator[tuple[str, Section]]:
+    """Yield a section and all sections in it, with the prefixes of their keys."""
+    yield prefix, section
+    for name, value in section:
         if isinstance(value, Section):
-            yield from _set_keys(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}"
+            yield from _sections(value, f"{prefix}{name}.")

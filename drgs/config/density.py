@@ -1,140 +1,35 @@
-"""The section ``densify`` of a configuration, with a section for each density strategy."""
+"""The section ``densify`` of a configuration, with sections of density strategies."""
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Annotated, ClassVar
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from drgs.config.extensions import STRATEGIES, StrategyName
-from drgs.config.section import UNRESOLVED, Count, Resolved, Section, subsection
+from drgs.config.extensions import STRATEGIES
+from drgs.config.section import (
+    Count,
+    ExtensibleSection,
+    Resolved,
+    Section,
+    name_of,
+    subsection,
+)
 
 REFERENCE_START, REFERENCE_STOP = 500, 15_000  # iterations: the reference's schedule, for 30,000
 
 
-class Schedule(NamedTuple):
-    """Defaults of a strategy: see ``drgs.training.density.strategy.DensityStrategy``."""
-
-    start_share: float  # of the iterations
-    stop_share: float
-    rate_decay: float = 0.1  # of the learning rates, over the fit
-
-
-DEFAULT_SCHEDULE = Schedule(1 / 20, 1 / 2)
-
-SCHEDULES = {
-    "adc": Schedule(1 / 2, 5 / 7, rate_decay=1.0),
-    "budget": Schedule(1 / 20, 3 / 4, rate_decay=0.03),
-    "mcmc": Schedule(1 / 20, 5 / 7),
-}
-"""Schedules by strategy. Of 7,000 iterations, adc leaves 2,000 for the last opacities to settle."""
-
-
-def schedule_of(strategy: str) -> Schedule:
-    """Return the defaults of a strategy; no shipped one is imported."""
-    if strategy in SCHEDULES:
-        return SCHEDULES[strategy]
-    extension = STRATEGIES.get(strategy).value
-    return Schedule(extension.start_share, extension.stop_share, extension.rate_decay)
-
-
-class AdcConfig(Section):
-    """The strategy ``adc``, adaptive density control: clone, split, prune, opacity reset."""
-
-    grad_threshold: float = Field(
-        2e-4,
-        gt=0,
-        description="Clone or split a Gaussian whose 2D position gradient has at least this mean "
-        "norm, in NDC units, over the views that it is visible in.",
-    )
-    clone_scale: float = Field(
-        0.01,
-        gt=0,
-        description="Clone up to this largest scale, split above it; in scene extents.",
-    )
-    split_count: int = Field(
-        2, ge=2, le=1_000_000, description="Number of samples that replace a split Gaussian."
-    )
-    split_shrink: float = Field(1.6, gt=1, description="Divisor of the samples' scales.")
-    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Remove less opaque Gaussians.")
-    prune_scale: float = Field(
-        0.1,
-        gt=0,
-        description="Remove Gaussians of a larger scale after the first reset; in scene extents.",
-    )
-    reset_every: Count = Field(
-        3000, ge=1, description="Iterations between opacity resets, up to densify.stop."
-    )
-    reset_opacity: float = Field(0.01, gt=0, lt=1, description="Maximum opacity after a reset.")
-    white_background_reset: Count | None = Field(
-        500, ge=1, description="Iteration of an extra reset if the background is white; null: none."
-    )
-
-
-class BudgetConfig(Section):
-    """The strategy ``budget``: growth to a given number of Gaussians, where errors are largest."""
-
-    gaussians: Resolved[Count] = Field(
-        UNRESOLVED,
-        ge=4,
-        description="Number of Gaussians after two thirds of the changes. null: 250 times the "
-        "square root of an image's number of pixels, 100,000 for 400 x 400 px.",
-    )
-    error_every: Count = Field(
-        10,
-        ge=1,
-        description="Iterations between measurements of errors; each takes half an iteration.",
-    )
-    prune_opacity: float = Field(
-        0.05, ge=0, lt=1, description="Replace less opaque Gaussians by halves of others."
-    )
-
-
-class McmcConfig(Section):
-    """The strategy ``mcmc`` (Kheradmand et al. 2024): relocation, noise and regularisers."""
-
-    gaussians: Resolved[Count] = Field(
-        UNRESOLVED,
-        ge=4,
-        description="Final number of Gaussians. null: as with budget.",
-    )
-    growth: float = Field(
-        0.05, ge=0, le=10, description="Relative growth of the population at each change."
-    )
-    spread: float = Field(
-        1.0,
-        ge=0,
-        le=10,
-        description="Displacement of copies, in standard deviations; 0 in the paper.",
-    )
-    min_opacity: float = Field(
-        0.005, gt=0, lt=1, description="Relocate Gaussians up to this opacity."
-    )
-    noise_lr: float = Field(
-        1e5,
-        ge=0,
-        le=1e12,
-        description="Factor of the noise on means, times their rate and the covariance in squared "
-        "scene extents. The paper's value, about 1e7, costs 2 dB in small images.",
-    )
-    opacity_weight: float = Field(
-        0.01, ge=0, le=1e6, description="Weight of the mean opacity in the loss."
-    )
-    scale_weight: float = Field(
-        0.05, ge=0, le=1e6, description="Weight of the mean scale, in scene extents, in the loss."
-    )
-
-
 class PruneConfig(Section):
-    """Pruning to a given number of Gaussians, after any strategy."""
+    """Pruning to a given number of Gaussians, after any strategy.
+
+    Opacities are lowered against the loss until enough Gaussians are transparent.
+    """
+
+    removed: ClassVar = {"method": "selection", "opacity": 0.005, "opacity_rate": 4.0}
+    scaled: ClassVar = ("start", "stop")
 
     to: Count | None = Field(
         None, ge=1, description="Maximum number of Gaussians at the end; null: no pruning."
-    )
-    method: Literal["selection", "importance"] = Field(
-        "selection",
-        description="selection: opacities are lowered against the loss until enough Gaussians are "
-        "transparent. importance: Gaussians that contribute least to images are removed.",
     )
     start: Count | None = Field(
         None,
@@ -147,28 +42,15 @@ class PruneConfig(Section):
         description="Iteration of the last change. null: half of the remaining ones.",
     )
     every: Count = Field(50, ge=1, description="Iterations between two changes.")
-    opacity: float = Field(
-        0.005, gt=0, lt=1, description="selection: remove less opaque Gaussians."
-    )
-    opacity_rate: float = Field(
-        4.0,
-        gt=0,
-        le=100,
-        description="selection: factor of optimizer.opacities_lr during this phase.",
-    )
 
 
-class StopAim(Section):
-    """Target of growth after an iteration."""
+class DensifyConfig(ExtensibleSection):
+    """Changes of the number of Gaussians; with a section for each strategy, under its name."""
 
-    after: Count = Field(ge=0, description="Last iteration before this value applies.")
-    stop: Count = Field(ge=1, description="Value of densify.stop from then on.")
+    registries: ClassVar = (STRATEGIES,)
+    scaled: ClassVar = ("start", "stop")
 
-
-class DensifyConfig(Section):
-    """Changes of the number of Gaussians."""
-
-    strategy: StrategyName = Field(
+    strategy: Annotated[str, name_of(STRATEGIES)] = Field(
         "budget",
         description="How the population changes. adc: adaptive density control, as in the paper "
         "(Kerbl et al. 2023); budget: growth to a given number of Gaussians, where errors are "
@@ -188,11 +70,6 @@ class DensifyConfig(Section):
         "at this iteration. Not given, or null: 3/4 of the iterations with budget, else 5/7 of "
         "them; with adc at most 15,000.",
     )
-    stop_aims: list[StopAim] = Field(
-        default_factory=list,
-        description="Earlier values of stop, before revisions of --budget: a list of "
-        "{after: iteration, stop: iteration}.",
-    )
     every: Count = Field(100, ge=1, description="Iterations between two changes.")
     max_gaussians: int = Field(
         1_000_000, ge=4, le=100_000_000, description="Limit that the population never exceeds."
@@ -202,23 +79,17 @@ class DensifyConfig(Section):
         description="Remove Gaussians close before a few cameras, after 50, 70 and 90 % of the "
         "iterations.",
     )
-    adc: AdcConfig = subsection(AdcConfig)
-    budget: BudgetConfig = subsection(BudgetConfig)
-    mcmc: McmcConfig = subsection(McmcConfig)
     prune: PruneConfig = subsection(PruneConfig)
 
-    def stop_at_iteration(self, iteration: int) -> int:
-        """Return the value of ``stop`` at this iteration."""
-        aims = [aim.stop for aim in self.stop_aims if aim.after < iteration]
-        return aims[-1] if aims else self.stop
+    @property
+    def settings(self) -> Section | None:
+        """The section of the chosen strategy; None: it has no settings."""
+        return self.sections.get(self.strategy)
 
-    @field_validator("stop_aims")
-    @classmethod
-    def _check_order(cls, aims: list[StopAim]) -> list[StopAim]:
-        starts = [aim.after for aim in aims]
-        if starts != sorted(set(starts)) or starts[:1] not in ([], [0]):
-            raise ValueError("must begin after iteration 0, with growing after")
-        return aims
+    @property
+    def has_goal(self) -> bool:
+        """True if the strategy's section has a number of ``gaussians`` to which it grows."""
+        return "gaussians" in type(self.settings or self).model_fields
 
     def prune_window(self, iterations: int) -> tuple[int, int]:
         """Return the iteration after which pruning begins, and that of its last change.

@@ -9,12 +9,13 @@ from typing import get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 from typing_extensions import override
 
-from drgs.config.extensions import extension_keys
+from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
-from drgs.config.section import expectation, format_value
+from drgs.config.section import ExtensibleSection, expectation, format_value
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.files import atomic_path, read_text
 
@@ -59,15 +60,32 @@ def dump_config(config: FitConfig, path: str | Path) -> None:
 
 def known_keys() -> list[str]:
     """Return dotted names of every section and value, such as ``densify.every``."""
-    return list(_fields(FitConfig))
+    return list(_keys(FitConfig))
 
 
-def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
-    for name, field in model.model_fields.items():
+def _keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    sections = {name: _section(field.annotation) for name, field in model.model_fields.items()}
+    if issubclass(model, ExtensibleSection):
+        sections |= {extension.name: extension.section for extension in model.extensions()}
+    for name, section in sections.items():
         yield prefix + name
-        section = _section(field.annotation)
         if section is not None:
-            yield from _fields(section, f"{prefix}{name}.")
+            yield from _keys(section, f"{prefix}{name}.")
+
+
+def _find(key: str) -> FieldInfo | None:
+    """Return the field of a dotted name, imported where it is an extension's; None: it has none."""
+    model, field = FitConfig, None
+    for name in (part for part in key.split(".") if not part.isdigit()):
+        if model is None:
+            return None
+        if (field := model.model_fields.get(name)) is not None:
+            model = _section(field.annotation)
+        elif issubclass(model, ExtensibleSection) and (extension := model.extension(name)):
+            model, field = extension.section, FieldInfo(annotation=extension.section)
+        else:
+            return None
+    return field
 
 
 def _section(annotation: object) -> type[BaseModel] | None:
@@ -148,9 +166,11 @@ def _parse_override(override: str) -> tuple[str, object]:
     key = key.strip()
     if not equals or not key:
         raise UserError(f"--set {override}: must be KEY=VALUE, as in densify.every=200")
-    known = extension_keys() if key.startswith("extensions.") else known_keys()
-    if key not in known:
-        raise UserError(f"--set {key}: unknown key {key}{did_you_mean(key, known)}")
+    if key.startswith("extensions."):  # the place in earlier versions
+        key = key.removeprefix("extensions.")
+        key = f"densify.{key}" if key.partition(".")[0] in STRATEGIES else key
+    if _find(key) is None:
+        raise UserError(f"--set {key}: unknown key {key}{did_you_mean(key, known_keys())}")
     if key in PATH_KEYS:
         return key, None if text == "null" else _absolute(Path(), text, f"--set {key}")
     try:
@@ -184,7 +204,7 @@ def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
         return f"{where}: unknown key {key}{did_you_mean(key, known_keys())}"
     if kind == "missing":
         return f"{where}: {key} is missing: {_description(key)}"
-    if kind == "value_error" and key in ("", "extensions"):
+    if kind == "value_error" and not key:
         # A relation between values that may come from the file and from the command line.
         origin = f"{file} with --set {' '.join(sorted(overridden))}" if overridden else file
         return f"{origin}: {context['error']}"
@@ -192,10 +212,6 @@ def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
 
 
 def _description(key: str) -> str:
-    model: type[BaseModel] | None = FitConfig
-    *sections, leaf = (part for part in key.split(".") if not part.isdigit())
-    for section in sections:
-        model = _section(model.model_fields[section].annotation)
-        assert model is not None, "pydantic names sections only"
-    field = model.model_fields[leaf]
+    field = _find(key)
+    assert field is not None, "pydantic names fields"
     return field.description or getattr(field.annotation, "__doc__", "")

@@ -7,9 +7,10 @@ has those of the paper (Kerbl et al. 2023, section 7, and its released code).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     BaseModel,
@@ -23,11 +24,22 @@ from pydantic import (
     model_validator,
 )
 from pydantic.fields import FieldInfo
+from typing_extensions import override
 
 from drgs.config.approximations import DECLARED, Approximations, Declared, Value
-from drgs.config.density import REFERENCE_START, REFERENCE_STOP, DensifyConfig, schedule_of
-from drgs.config.extensions import LossName, ReaderName, Sections
-from drgs.config.section import UNRESOLVED, Count, Rate, Resolved, Section, Weight, subsection
+from drgs.config.density import REFERENCE_START, DensifyConfig
+from drgs.config.extensions import EFFECTS, LOSS_TERMS, LOSSES, READERS, STRATEGIES, section_of
+from drgs.config.section import (
+    UNRESOLVED,
+    Count,
+    ExtensibleSection,
+    Rate,
+    Resolved,
+    Section,
+    Weight,
+    name_of,
+    subsection,
+)
 from drgs.core.constants import MAX_SHUTTER_SAMPLES, SHUTTER_SAMPLES
 
 Color = str | tuple[float, float, float]
@@ -59,8 +71,6 @@ ColorField = Annotated[
 ]
 PathField = Annotated[Path, Field(strict=False)]
 
-CameraRate = Annotated[float, Field(le=1)]  # radians, scene extents, log focal lengths, image sizes
-
 Decay = Annotated[float, Field(ge=0, le=0.999999)]  # float32 has few numbers between this and 1
 
 
@@ -71,7 +81,7 @@ class DataConfig(Section):
     source: str = Field(
         "", description="Source of the data, for the error message if the folder is missing."
     )
-    type: ReaderName = Field(
+    type: Annotated[str, name_of(READERS, "auto")] = Field(
         "auto",
         description="Layout of the folder. auto: by transforms_train.json, transforms.json, or a "
         "COLMAP model in sparse/0, sparse, colmap/sparse/0, dense/0 or beside the photographs.",
@@ -149,6 +159,8 @@ class DataConfig(Section):
 class InitConfig(Section):
     """The Gaussians at iteration 0."""
 
+    removed: ClassVar = {"scale": 1.0}
+
     start: Literal["auto", "masks", "points", "random"] = Field(
         "auto",
         description="Start of the Gaussians. masks: the surface of the visual hull of the images' "
@@ -172,13 +184,6 @@ class InitConfig(Section):
         "cameras of NeRF-synthetic scenes, else a box derived from the cameras.",
     )
     opacity: float = Field(0.1, ge=1e-6, le=0.999999, description="Initial opacity.")
-    scale: float = Field(
-        1.0,
-        ge=1e-3,
-        le=1e3,
-        description="Initial standard deviation, relative to the RMS distance to the three nearest "
-        "neighbours.",
-    )
     point_cloud: PathField | None = Field(
         None,
         description="PLY with x, y, z (and red, green, blue), or a points3D file of COLMAP. null: "
@@ -201,6 +206,8 @@ class InitConfig(Section):
 
 class _Model(Section):
     """Fields of :class:`ModelConfig` before the approximations."""
+
+    scaled: ClassVar = ("sh_increase_every",)
 
     sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
     sh_increase_every: Resolved[Count] = Field(
@@ -277,24 +284,14 @@ class ModelConfig(_ModelWithApproximations):
         return Approximations.from_values(vars(self))
 
 
-class RateAim(Section):
-    """Target of a falling rate after an iteration."""
-
-    after: Count = Field(ge=0, description="Last iteration before this value applies.")
-    end: Count = Field(ge=1, description="Iteration at which the rate would reach its final value.")
-
-
 class OptimizerConfig(Section):
     """Adam (Kingma and Ba 2015): learning rates per step and its constants."""
+
+    removed: ClassVar = {"epsilon": 1e-15}
 
     means_lr: Rate = Field(3.2e-4, gt=0, description="Initial rate of the means, in scene extents.")
     means_lr_final: Rate = Field(
         3.2e-6, gt=0, description="Final rate of the means; the decay is exponential."
-    )
-    means_lr_aims: list[RateAim] = Field(
-        default_factory=list,
-        description="Ends of the decay after revisions of --budget: a list of "
-        "{after: iteration, end: iteration}; empty: at the last iteration.",
     )
     sh0_lr: Rate = Field(5e-3, ge=0, description="Rate of the degree-0 colour coefficients.")
     shN_lr: Rate = Field(1e-3, ge=0, description="Rate of the higher degrees.")  # noqa: N815
@@ -343,75 +340,21 @@ class OptimizerConfig(Section):
     )
     beta_1: Decay = Field(0.9, description="Decay of the first moment.")
     beta_2: Decay = Field(0.999, description="Decay of the second moment.")
-    epsilon: float = Field(
-        1e-15,
-        ge=1e-30,
-        le=1,
-        description="Added to the root of the second moment.",
-    )
 
 
 class LossConfig(Section):
     """(1 - w) L1 + w (1 - SSIM), in display space."""
 
-    type: LossName = Field("photometric", description="photometric, or the name of an extension.")
-    dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 disables D-SSIM.")
-    window: int = Field(11, ge=3, le=17, description="px: width of SSIM's Gaussian window; odd.")
-    sigma: float = Field(
-        1.5, ge=0.1, le=1000, description="px: standard deviation of SSIM's window."
+    removed: ClassVar = {"window": 11, "sigma": 1.5}
+
+    type: Annotated[str, name_of(LOSSES)] = Field(
+        "photometric", description="photometric, or the name of an extension."
     )
+    dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 disables D-SSIM.")
     depth_weight: Weight = Field(
         0.2,
         description="Weight of the mean absolute error of depth, in scene extents, if the data has "
         "depth.",
-    )
-
-
-class ColorConfig(Section):
-    """Exposure and white balance of each training photograph, and each camera's vignetting."""
-
-    lr: Rate | None = Field(
-        None,
-        gt=0,
-        description="Initial rate of the 3 x 4 numbers of each transform, such as 0.02; decays as "
-        "the rate of the means. null: no transforms.",
-    )
-    identity_weight: Weight = Field(
-        1.0, description="Weight of the mean squared difference from the identity."
-    )
-    vignetting_lr: Rate | None = Field(
-        None,
-        gt=0,
-        description="Initial rate of the three coefficients of each camera's vignetting, such as "
-        "0.03. null: no vignetting.",
-    )
-    response_lr: Rate | None = Field(
-        None,
-        gt=0,
-        description="Initial rate of the two numbers by which each camera's response differs from "
-        "the mean of all, such as 0.005. null: the same response.",
-    )
-
-
-class CamerasConfig(Section):
-    """Refinement of the training cameras; rates, for 30,000 iterations, decay as the means'.
-
-    A pose has one step per use of its image: 70 in 7,000 iterations of 100 images.
-    """
-
-    optimise: bool = Field(False, description="Refine poses, focal lengths and principal points.")
-    start: Count = Field(0, ge=0, description="Last iteration before it begins.")
-    rotation_lr: CameraRate = Field(3e-4, ge=0, description="Initial rate of rotations, radians.")
-    translation_lr: CameraRate = Field(
-        3e-4, ge=0, description="Initial rate of translations, scene extents."
-    )
-    focal_lr: CameraRate = Field(
-        0.0, ge=0, description="Initial relative rate of the focal lengths, shared by all views."
-    )
-    principal_lr: CameraRate = Field(
-        0.0,
-        ge=0,
-        description="Initial rate of the principal point, image sizes, shared by all views.",
     )
 
 
@@ -458,16 +401,33 @@ def _format_section(section: BaseModel) -> str:
     return f"{{{', '.join(f'{name}: {value}' for name, value in section)}}}"
 
 
-class FitConfig(Section):
-    """The configuration of a fit."""
+def _read_revised_plan(values: Mapping[Any, object]) -> Mapping[Any, object]:
+    """Read a plan that the clock of an earlier version has revised as its last one, cut."""
+    values, aims = dict(values), []
+    for name, key in (("optimizer", "means_lr_aims"), ("densify", "stop_aims")):
+        if isinstance(section := values.get(name), Mapping) and key in section:
+            values[name] = {k: v for k, v in section.items() if k != key}
+            aims.append(section[key])
+    try:
+        if aims and aims[0]:
+            last: Any = values["iterations"]
+            values |= {"iterations": max(last, aims[0][-1].get("end", 0)), "stop_after": last}
+    except (AttributeError, KeyError, TypeError):
+        got = f"means_lr_aims must be a list of after and end, got {aims[0]}"
+        raise ValueError(f"optimizer.{got}; remove it") from None
+    return values
+
+
+class FitConfig(ExtensibleSection):
+    """The configuration of a fit; with sections of extensions, under their names."""
+
+    registries: ClassVar = (EFFECTS, LOSSES, LOSS_TERMS, READERS)
 
     data: DataConfig
     init: InitConfig = subsection(InitConfig)
     model: ModelConfig = subsection(ModelConfig)
     optimizer: OptimizerConfig = subsection(OptimizerConfig)
     loss: LossConfig = subsection(LossConfig)
-    colors: ColorConfig = subsection(ColorConfig)
-    cameras: CamerasConfig = subsection(CamerasConfig)
     densify: DensifyConfig = subsection(DensifyConfig)
     output: OutputConfig = subsection(OutputConfig)
     iterations: Count = Field(
@@ -475,6 +435,12 @@ class FitConfig(Section):
         ge=1,
         description="Number of rendered views; each is a step unless optimizer.views_per_step is "
         "set.",
+    )
+    stop_after: Count | None = Field(
+        None,
+        ge=1,
+        description="Last iteration, where a clock or a viewer has ended a fit that was planned "
+        "for another number of iterations. null: iterations.",
     )
     coarse: Resolved[list[CoarseStage]] = Field(
         UNRESOLVED,
@@ -484,11 +450,11 @@ class FitConfig(Section):
         "paper.",
     )
     seed: Count = Field(0, ge=0, description="Seed of all random numbers.")
-    extensions: Sections = Field(
-        default_factory=dict,
-        description="Sections of extensions, by name; a section, even an empty one, activates an "
-        "effect or a loss term.",
-    )
+
+    @property
+    def last_iteration(self) -> int:
+        """The last iteration that is run; rates and changes are planned for ``iterations``."""
+        return self.iterations if self.stop_after is None else self.stop_after
 
     @property
     def data_for_training(self) -> DataConfig:
@@ -500,28 +466,50 @@ class FitConfig(Section):
         """``data``, without depth."""
         return self.data.model_copy(update={"ignore_depth": True})
 
+    @override
+    @classmethod
+    def relocate(cls, values: Mapping[Any, object]) -> Mapping[Any, object]:
+        """Move what earlier versions have elsewhere: ``extensions``, and revised plans."""
+        values = _read_revised_plan(values)
+        sections = values.get("extensions")
+        if not isinstance(sections, Mapping):
+            return values
+        values = {key: value for key, value in values.items() if key != "extensions"}
+        for name, section in sections.items():
+            place = values
+            if name in STRATEGIES and isinstance(densify := values.get("densify", {}), Mapping):
+                place = values["densify"] = dict(densify)
+            newer = place.get(name)
+            if isinstance(section, Mapping) and isinstance(newer, Mapping):
+                section = {**section, **newer}
+            place[name] = newer if section is None else section
+        return values
+
     @model_validator(mode="after")
     def _follow_from_iterations(self) -> FitConfig:
-        """Resolve the part of the schedule that is not given."""
+        """Resolve the part of the schedule that is not given, and the strategy's section."""
         model, densify, n = self.model, self.densify, self.iterations
         if _is_open(model, "sh_increase_every"):
             every = max(1, min(LATEST_DEGREE, round(DEGREE_SHARE * n)))
             self._complete("model", {"sh_increase_every": every})
-        start_share, stop_share, rate_decay = schedule_of(densify.strategy)
+        extension = STRATEGIES.get(densify.strategy)
+        strategy = extension.value
         if self.optimizer.decay is None:
-            self._complete("optimizer", {"decay": rate_decay})
+            self._complete("optimizer", {"decay": strategy.rate_decay})
         changes, first = {}, densify.start
+        if (section := section_of(extension, densify.sections)) is not None:
+            changes[densify.strategy] = section
         if _is_open(densify, "stop"):
             least = 1 if _is_open(densify, "start") else first + 1
-            most = REFERENCE_STOP if densify.strategy == "adc" else n
-            changes["stop"] = max(least, min(most, round(stop_share * n)))
+            suitable = min(strategy.latest_stop, round(strategy.stop_share * n))
+            changes["stop"] = max(least, suitable)
         if _is_open(densify, "start"):
-            first = max(1, round(start_share * n))
+            first = max(1, round(strategy.start_share * n))
             changes["start"] = min(REFERENCE_START, first, changes.get("stop", densify.stop) // 2)
         self._complete("densify", changes)
         return self
 
-    def _complete(self, section: str, changes: dict[str, float]) -> None:
+    def _complete(self, section: str, changes: dict[str, Any]) -> None:
         """Set values of a section, which is frozen once it is validated."""
         completed = getattr(self, section).model_copy(update=changes)
         object.__setattr__(self, section, completed)
@@ -548,46 +536,30 @@ class FitConfig(Section):
         last = optimizer.means_lr_final
         expected = f"optimizer.means_lr_final must be <= optimizer.means_lr ({optimizer.means_lr})"
         _require(last <= optimizer.means_lr, expected, last)
-        opacity, reset = densify.adc.prune_opacity, densify.adc.reset_opacity
-        expected = f"densify.adc.prune_opacity must be < densify.adc.reset_opacity ({reset})"
-        _require(opacity < reset, f"{expected}, or a reset removes everything", opacity)
-        if self.cameras.optimise:
-            expected = (
-                "model.sh_direction must be mean where cameras.optimise is true (colours along "
-                "rays are not differentiated in the camera)"
-            )
-            is_mean = self.model.sh_direction == "mean"
-            _require(is_mean, expected, self.model.sh_direction)
+        for section in (*densify.sections.values(), *self.sections.values()):
+            section.check(self)
         if densify.prune.to is not None:
             self._check_last_phase()
-        caps = {"densify.max_gaussians": densify.max_gaussians}
-        if densify.strategy == "mcmc" and densify.mcmc.gaussians is not None:
-            caps["densify.mcmc.gaussians"] = densify.mcmc.gaussians
-        for name, cap in caps.items():
-            num_points = init.num_points if init.point_cloud is None else None
-            fits = num_points is None or num_points <= cap
-            _require(fits, f"init.num_points must be <= {name} ({cap})", init.num_points)
+        self.require_room("densify.max_gaussians", densify.max_gaussians)
         for before, after in pairwise(self.coarse or ()):
             is_in_order = before.until < after.until and before.factor > after.factor
             got = f"{_format_section(before)} before {_format_section(after)}"
             expected = "coarse must be stages with growing until and falling factor"
             _require(is_in_order, expected, got)
-        aims = optimizer.means_lr_aims
-        starts = [aim.after for aim in aims]
-        is_growing = starts == sorted(set(starts)) and all(aim.end > aim.after for aim in aims)
-        got = ", ".join(map(_format_section, aims))
-        _require(is_growing, "optimizer.means_lr_aims must have growing after < end", got)
-        _require(self.loss.window % 2 == 1, "loss.window must be odd", self.loss.window)
         return self
 
+    def require_room(self, key: str, cap: int | None) -> None:
+        """Raise ValueError if more points than ``cap``, the value of a key, are given."""
+        num_points = self.init.num_points if self.init.point_cloud is None else None
+        fits = num_points is None or cap is None or num_points <= cap
+        _require(fits, f"init.num_points must be <= {key} ({cap})", num_points)
+
     def _check_last_phase(self) -> None:
-        """Check that pruning takes place, unless ``--budget`` has revised the plan."""
+        """Check that pruning takes place."""
         prune, n = self.densify.prune, self.iterations
         start = self.densify.prune_window(n)[0]
         expected = f"densify.prune.stop must be > densify.stop and densify.prune.start ({start})"
         _require(prune.stop is None or prune.stop > start, expected, prune.stop)
-        if self.optimizer.means_lr_aims:
-            return
         last = {"densify.stop": self.densify.stop, "densify.prune.start": prune.start or 0}
         for name, iteration in last.items():
             expected = f"{name} must be < iterations ({n}), or there is none left for "

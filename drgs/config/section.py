@@ -5,14 +5,30 @@ from __future__ import annotations
 import json
 import math
 import re
-from typing import TYPE_CHECKING, Annotated, Any, Optional, TypeVar
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Optional, TypeVar, cast, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    create_model,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+from pydantic_core.core_schema import ErrorType
+from typing_extensions import LiteralString, Self
 
 from drgs.core.constants import MAX_INT
-from drgs.core.errors import UserError, one_line
+from drgs.core.errors import UserError, did_you_mean, one_line
+from drgs.core.registry import HOW_TO_INSTALL, Extension, Registry, shipped_modules
+
+if TYPE_CHECKING:
+    from drgs.config.schema import FitConfig
 
 Count = Annotated[int, Field(le=MAX_INT)]
 
@@ -36,8 +52,127 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
+    scaled: ClassVar[tuple[str, ...]] = ()
+    """Names of iterations that keep their share where the number of iterations changes."""
+
+    removed: ClassVar[Mapping[str, object]] = {}
+    """Values of earlier versions that are constants now."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_removed(cls, values: object) -> object:
+        if not isinstance(values, Mapping) or not cls.removed.keys() & values.keys():
+            return values
+        for name, constant in cls.removed.items():
+            if values.get(name, constant) != constant:
+                text = (
+                    f"must be {format_value(constant)}, its only value since 0.1.0 (CHANGELOG.md)"
+                )
+                error = ErrorDetails(type=text, loc=(name,), msg=text, input=values[name])
+                raise ValidationError.from_exception_data(name, [_error_details(error)])
+        return {name: value for name, value in values.items() if name not in cls.removed}
+
+    @property
+    def is_off(self) -> bool:
+        """True if a fit with this section is a fit without it."""
+        return False
+
+    def check(self, config: FitConfig) -> None:
+        """Raise ValueError for values that do not suit others of the configuration."""
+
 
 SectionType = TypeVar("SectionType", bound=Section)
+
+
+class ExtensibleSection(Section):
+    """A section that contains sections of extensions, too, under their names."""
+
+    model_config = ConfigDict(extra="allow")
+
+    registries: ClassVar[tuple[Registry, ...]] = ()  # of these extensions
+
+    @property
+    def sections(self) -> Mapping[str, Section]:
+        """The sections of extensions by name."""
+        return self.model_extra or {}
+
+    def section(self, name: str, model: type[SectionType]) -> SectionType:
+        """Return the section of an extension, by default with all defaults."""
+        found = self.sections.get(name)
+        return found if isinstance(found, model) else model.model_validate({})
+
+    @classmethod
+    def extension(cls, name: str) -> Extension | None:
+        """Import and return the extension of a section; None: there is none."""
+        shipped = (each for each in cls.registries if name in shipped_modules(each.group))
+        others = (each for each in cls.registries if name in each)
+        registry = next(shipped, None) or next(others, None)
+        return None if registry is None else registry.get(name)
+
+    @classmethod
+    def extensions(cls) -> Iterator[Extension]:
+        """Import and yield the extensions that have settings, or are active by their section."""
+        for registry in cls.registries:
+            yield from (e for e in registry.all() if e.section or not e.is_shipped)
+
+    @classmethod
+    def relocate(cls, values: Mapping[Any, object]) -> Mapping[Any, object]:
+        """Return given values, with the keys of earlier versions replaced."""
+        return values
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _validate_sections(cls, values: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        if not isinstance(values, Mapping):
+            return handler(values)
+        values = cls.relocate(values)
+        own = {key: value for key, value in values.items() if key in cls.model_fields}
+        others = {str(key): _to_mapping(values[key]) for key in values if key not in own}
+        extensions = [extension for name in others if (extension := cls.extension(name))]
+        models: dict[str, Any] = {each.name: (each.section or Section, ...) for each in extensions}
+        sections = create_model("Sections", __base__=Section, **models)
+        valid, errors = [], []
+        for validate, given in ((handler, own), (sections.model_validate, others)):
+            try:
+                valid.append(validate(given))
+            except ValidationError as error:
+                errors += map(_error_details, error.errors())
+        if errors:
+            raise ValidationError.from_exception_data(cls.__name__, errors)
+        result = cast(Self, valid[0])
+        assert result.__pydantic_extra__ is not None, "extra is allowed"
+        result.__pydantic_extra__.update({name: getattr(valid[1], name) for name in others})
+        result.__pydantic_fields_set__.update(others)
+        return result
+
+
+def _to_mapping(section: object) -> object:
+    """Return a section as a file has it; null is an empty one."""
+    return section.model_dump() if isinstance(section, BaseModel) else section or {}
+
+
+def _error_details(error: ErrorDetails) -> InitErrorDetails:
+    """Return an error as pydantic accepts it."""
+    kind = error["type"]
+    if kind not in get_args(ErrorType):  # our own, or one that pydantic has in Python
+        kind = PydanticCustomError(cast(LiteralString, kind), "{text}", {"text": error["msg"]})
+    context = error.get("ctx", {})
+    return InitErrorDetails(type=kind, loc=error["loc"], input=error["input"], ctx=context)
+
+
+def name_of(registry: Registry, *others: str) -> AfterValidator:
+    """Return a validator of an extension's name; others: words that are no extension's."""
+
+    def check(name: str) -> str:
+        if name not in others and name not in registry:
+            known = [*others, *registry.names()]
+            quoted = ", ".join(f"'{each}'" for each in known)
+            raise ValueError(
+                f"must be one of {quoted}{did_you_mean(name, known)} ({HOW_TO_INSTALL})"
+            )
+        return name
+
+    return AfterValidator(check)
 
 
 def subsection(model: type[SectionType]) -> SectionType:

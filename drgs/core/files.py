@@ -6,6 +6,7 @@ Errors of the file system become a :class:`drgs.core.errors.UserError`.
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import stat
@@ -161,6 +162,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def write_json(path: Path, content: object, indent: int = 1) -> None:
+    """Write a file of JSON, in one piece."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
 
 
 def remove_stale_temporaries(folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 A decorator registers a class or function, with the pydantic model of its configuration section::
 
-    from drgs.training.density import STRATEGIES
+    from drgs.config.extensions import STRATEGIES
 
     class Settings(Section):
         growth: float = 0.01
@@ -10,19 +10,26 @@ A decorator registers a class or function, with the pydantic model of its config
     @STRATEGIES.register("my_strategy", section=Settings)
     class MyStrategy(DensityStrategy): ...
 
-Shipped implementations use it, too; their modules are imported when they are used. An installed
-package has an entry point of the group ``drgs``, whose value is the module with the decorators. A
-configuration names extensions, not modules, so that reading one runs no code.
+An entry point of the registry's group, whose value is the module with the decorator, makes the name
+known; the module is imported when the extension is used. What drgs ships has its entry points in
+``pyproject.toml`` and no other way in; those of missing modules are left out. Modules of the group
+``drgs`` may register extensions of all kinds. A configuration names extensions, not modules, so
+that reading one runs no code but theirs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
+from importlib.util import find_spec
+from pathlib import Path
 from traceback import walk_tb
+from types import ModuleType
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
 from typing_extensions import override
@@ -32,8 +39,13 @@ from drgs.core.errors import UserError, did_you_mean, one_line, root_cause
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-ENTRY_POINT_GROUP = "drgs"
+ANY_KIND = "drgs"
+"""Group of entry points whose modules register extensions of any kind."""
+
 HOW_TO_INSTALL = 'others come with installed packages that have an entry point of the group "drgs"'
+
+PROJECT = Path(__file__).parents[2] / "pyproject.toml"
+"""Of a checkout, whose installed metadata may be older."""
 
 T = TypeVar("T")
 Registered = TypeVar("Registered")
@@ -87,10 +99,9 @@ class Extension(Generic[T]):
 class Registry(Generic[T]):
     """The implementations of one extension point, by name."""
 
-    def __init__(self, kind: str, shipped: Mapping[str, str] | None = None) -> None:
-        """kind: of the extensions, for messages; shipped: module of each shipped one, by name."""
-        self.kind = kind
-        self._shipped = dict(shipped or {})
+    def __init__(self, kind: str, group: str) -> None:
+        """kind: of the extensions, for messages; group: of their entry points."""
+        self.kind, self.group = kind, group
         self._extensions: dict[str, Extension[T]] = {}
         _registries.append(self)
 
@@ -99,19 +110,19 @@ class Registry(Generic[T]):
     ) -> Callable[[Registered], Registered]:
         """Return a decorator that registers a class or function under ``name``.
 
-        section: model of the section ``extensions.NAME`` of a configuration.
+        section: model of the section ``NAME`` of a configuration.
 
         Raises ValueError if another module has registered the name.
         """
 
         def decorate(value: Registered) -> Registered:
             module = getattr(value, "__module__", type(value).__module__)
-            before = self._extensions.get(name)
-            owner = self._shipped.get(name) if before is None else before.module
+            before, shipped = self._extensions.get(name), shipped_modules(self.group)
+            owner = shipped.get(name) if before is None else before.module
             if owner not in (None, module):
                 raise ValueError(f'{self.kind} "{name}" is registered by {owner} already')
             others = (r for r in _registries if r is not self and name in r._extensions)
-            if name not in self._shipped and (other := next(others, None)) is not None:
+            if name not in shipped and (other := next(others, None)) is not None:
                 raise ValueError(f'a {other.kind} is called "{name}" already: names are sections')
             self._extensions[name] = Extension(self.kind, name, cast(T, value), section, module)
             return value
@@ -119,21 +130,18 @@ class Registry(Generic[T]):
         return decorate
 
     def __contains__(self, name: object) -> bool:
-        return name in self._shipped or name in self._extensions or name in self.names()
+        return name in shipped_modules(self.group) or name in self.names()
 
     @property
     def shipped_names(self) -> list[str]:
-        """The names of the extensions that drgs ships, in their order."""
-        return list(self._shipped)
-
-    def installed_extensions(self) -> list[Extension[T]]:
-        """Return the extensions that drgs does not ship, by name."""
-        _load_installed()
-        return [e for name, e in sorted(self._extensions.items()) if name not in self._shipped]
+        """The names of the extensions that drgs ships."""
+        return list(shipped_modules(self.group))
 
     def names(self) -> list[str]:
         """Return the names of all extensions, shipped ones first."""
-        return [*self._shipped, *(extension.name for extension in self.installed_extensions())]
+        _load_any_kind()
+        shipped = self.shipped_names
+        return [*shipped, *sorted({*self._extensions, *installed_points(self.group)} - {*shipped})]
 
     def get(self, name: str, place: str = "") -> Extension[T]:
         """Import and return the extension of this name.
@@ -141,23 +149,42 @@ class Registry(Generic[T]):
         place: of the name, such as ``scenes/lego.yml: densify.strategy``, for the
         :class:`UserError` for an unknown name.
         """
-        if name not in self._extensions and name in self._shipped:
-            import_module(self._shipped[name])
-        if name not in self:
+        if name not in self._extensions and (module := shipped_modules(self.group).get(name)):
+            import_module(module)
+        if name not in self._extensions and (point := installed_points(self.group).get(name)):
+            _load(point)
+        if name not in self._extensions and name not in self.names():
             known = self.names()
             start = f"{place}: " if place else ""
             raise UserError(
                 f'{start}no {self.kind} is called "{name}"{did_you_mean(name, known)}; there are '
                 f"{', '.join(known) or 'none'} ({HOW_TO_INSTALL})"
             )
+        if name not in self._extensions:
+            raise ExtensionError(
+                f'the entry point "{name}" of the group {self.group} registers no {self.kind} of '
+                "this name: repair or uninstall its package"
+            )
         return self._extensions[name]
+
+    def all(self) -> list[Extension[T]]:
+        """Import and return all extensions, shipped ones first."""
+        return [self.get(name) for name in self.names()]
+
+    def installed_extensions(self) -> list[Extension[T]]:
+        """Import and return the extensions that drgs does not ship, by name."""
+        return [self.get(name) for name in self.names() if name not in self.shipped_names]
 
 
 Base = TypeVar("Base")
 
 
 class ClassRegistry(Registry[type[Base]]):
-    """A registry of classes, each of which has its name as the attribute ``kind``."""
+    """A registry of classes, each of which has its name as an attribute."""
+
+    def __init__(self, kind: str, group: str, attribute: str = "kind") -> None:
+        super().__init__(kind, group)
+        self.attribute = attribute
 
     @override
     def register(
@@ -166,7 +193,7 @@ class ClassRegistry(Registry[type[Base]]):
         decorate = super().register(name, section)
 
         def register_class(cls: Registered) -> Registered:
-            cls.kind = name  # pyright: ignore[reportAttributeAccessIssue]
+            setattr(cls, self.attribute, name)
             return decorate(cls)
 
         return register_class
@@ -193,7 +220,8 @@ def temporary_registrations() -> Iterator[None]:
         for registry, extensions in before:
             # Modules of drgs are not imported again.
             now = registry._extensions
-            shipped = {name: now[name] for name in registry._shipped.keys() & now.keys()}
+            names = shipped_modules(registry.group).keys() & now.keys()
+            shipped = {name: now[name] for name in names}
             registry._extensions = {**shipped, **extensions}
 
 
@@ -219,21 +247,89 @@ def reporting_extensions() -> Iterator[None]:
         raise
 
 
-_loaded: set[str] = set()  # entry points whose modules have been imported
+def modules_of(group: str) -> dict[str, ModuleType]:
+    """Import and return the modules of a group's entry points by name, shipped ones first."""
+    shipped = {name: import_module(module) for name, module in shipped_modules(group).items()}
+    return shipped | {name: _load(point) for name, point in installed_points(group).items()}
 
 
-def _load_installed() -> None:
-    """Import the modules of the entry points; :class:`ExtensionError` if that fails."""
-    for point in entry_points(group=ENTRY_POINT_GROUP):
-        if point.value in _loaded:
-            continue
-        try:
-            point.load()
-        except Exception as error:
-            package = "" if point.dist is None else f" of the package {point.dist.name}"
-            cause = one_line(f"{type(error).__name__}: {error}")
-            raise ExtensionError(
-                f'cannot load the extension "{point.name}"{package} ({point.value}): {cause}; '
-                "repair or uninstall it"
-            ) from error
-        _loaded.add(point.value)
+@lru_cache
+def shipped_modules(group: str) -> Mapping[str, str]:
+    """Return the modules of a group's entry points of drgs, by name; missing ones are left out.
+
+    Raises :class:`UserError` where drgs is on Python's path without being installed.
+    """
+    points = _project_points() or _metadata_points()
+    if not points:
+        raise UserError(
+            f"drgs is not installed: {PROJECT.parent} is on Python's path, but has neither "
+            f'metadata nor the file {PROJECT.name}; run "pip install" for it'
+        )
+    modules = points.get(group, {})
+    return {name: modules[name] for name in sorted(modules) if _exists(modules[name])}
+
+
+@lru_cache
+def _project_points() -> Mapping[str, Mapping[str, str]]:
+    """Return the entry points of the checkout, by group and name; without one, none."""
+    with suppress(ImportError, OSError):  # Python 3.10 has no tomllib
+        import tomllib
+
+        project = tomllib.loads(PROJECT.read_text(encoding="utf-8")).get("project", {})
+        if project.get("name") == "drgs":
+            return project["entry-points"]
+    return {}
+
+
+@lru_cache
+def _metadata_points() -> Mapping[str, Mapping[str, str]]:
+    """Return the entry points of the installed package, by group and name; without one, none."""
+    points: dict[str, dict[str, str]] = {}
+    with suppress(PackageNotFoundError):
+        for point in distribution("drgs").entry_points:
+            points.setdefault(point.group, {})[point.name] = point.value
+    return points
+
+
+def _exists(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:  # of a package that contains it
+        return False
+
+
+def installed_points(group: str) -> Mapping[str, EntryPoint]:
+    """Return a group's entry points of other packages than drgs, by name."""
+    return _find_points(entry_points, group, tuple(sys.path))
+
+
+@lru_cache
+def _find_points(
+    find: Callable[..., Iterable[EntryPoint]], group: str, path: tuple[str, ...]
+) -> Mapping[str, EntryPoint]:
+    del path  # on which they are found
+    points = sorted(find(group=group), key=lambda point: point.name)
+    return {each.name: each for each in points if each.value.partition(".")[0] != "drgs"}
+
+
+_loaded: set[str] = set()  # entry points of any kind whose modules have been imported
+
+
+def _load_any_kind() -> None:
+    for point in installed_points(ANY_KIND).values():
+        if point.value not in _loaded:
+            _load(point)
+            _loaded.add(point.value)
+
+
+def _load(point: EntryPoint) -> ModuleType:
+    """Import and return the module of an entry point; :class:`ExtensionError` if that fails."""
+    try:
+        return point.load()
+    except Exception as error:
+        package = "" if point.dist is None else f" of the package {point.dist.name}"
+        cause = one_line(f"{type(error).__name__}: {error}")
+        raise ExtensionError(
+            f'cannot load the extension "{point.name}"{package} ({point.value}): {cause}; '
+            "repair or uninstall it"
+        ) from error

@@ -25,7 +25,7 @@ __all__ = ["Dataset", "View", "Viewpoint", "load_dataset"]
 def load_dataset(
     source: str | Path | DataConfig,
     keeps: ViewFilter = all_views,
-    sections: Mapping[str, BaseModel | None] = MappingProxyType({}),
+    sections: Mapping[str, BaseModel] = MappingProxyType({}),
     **settings: object,
 ) -> Dataset:
     """Return all views of a dataset: photographs with their cameras, to train and to measure on.

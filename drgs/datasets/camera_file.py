@@ -1,15 +1,20 @@
-"""Cameras of a file in the layout of ``transforms.json``, without its photographs."""
+"""Cameras in the layout of ``transforms.json``, without photographs: read, and as JSON."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import numpy as np
+
+from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.cameras.viewpoints import Viewpoint, panorama_intrinsics
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import UserError, UserNote
+from drgs.core.origin import WORLD, Origin
 from drgs.datasets.transforms import (
+    CLOSE_POSE_KEY,
     TransformsFrame,
     focal_from_angle,
     focal_length,
@@ -19,6 +24,14 @@ from drgs.datasets.transforms import (
     principal_point,
     read_transforms,
 )
+from drgs.datasets.types import View
+
+MODELS = {
+    "opencv": "FULL_OPENCV",
+    "fisheye": "OPENCV_FISHEYE",
+    "thin_prism_fisheye": "THIN_PRISM_FISHEYE",
+}
+"""COLMAP's lens names; other lenses have their registered names."""
 
 
 def read_viewpoints(
@@ -77,3 +90,34 @@ def _viewpoint_of(
             scale_length(key, side, principal_point) for key, side in (("cx", "w"), ("cy", "h"))
         )
     return Viewpoint(name, pose, focal, focal_y, cx, cy, width, height, lens, motion)
+
+
+def cameras_json(views: Iterable[View], origin: Origin) -> dict[str, object]:
+    """Return cameras in the layout of ``transforms.json``, in world coordinates.
+
+    origin: of the views' positions, world; recorded if not zero.
+    """
+    recorded = {"origin": list(origin)} if origin != WORLD else {}
+    frames = [
+        {
+            "file_path": view.name,
+            "transform_matrix": between_opencv_and_opengl(view.camera_to_world).tolist(),
+            **{"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy},
+            **{"w": view.width, "h": view.height},
+            **_lens_and_motion(view),
+        }
+        for view in (view.with_offset(np.array(origin)) for view in views)
+    ]
+    return {**recorded, "frames": frames}
+
+
+def _lens_and_motion(view: View) -> dict[str, object]:
+    """Return the values of a camera in ``transforms.json`` besides pose and intrinsics."""
+    values: dict[str, object] = {}
+    if view.lens is not None:
+        model = MODELS.get(view.lens.kind, view.lens.kind)
+        values |= {"camera_model": model, **view.lens.coefficients()}
+    if view.motion is not None:
+        values[CLOSE_POSE_KEY] = between_opencv_and_opengl(view.motion.close_to_world).tolist()
+        values["shutter"] = view.motion.shutter
+    return values

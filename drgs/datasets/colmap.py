@@ -41,6 +41,8 @@ PHOTOGRAPHS = FileKind("photographs", remedy="put the photographs there that COL
 class ColmapReader(DatasetReader):
     """Reads a model of COLMAP and its photographs."""
 
+    order = 2
+
     @override
     def recognizes(self, folder: Path) -> bool:
         return find_model(folder) is not None

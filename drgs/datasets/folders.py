@@ -40,7 +40,7 @@ GUIDE = "docs/guide/photographs.md"
 
 
 def find_reader(
-    config: DataConfig, sections: Mapping[str, BaseModel | None] = MappingProxyType({})
+    config: DataConfig, sections: Mapping[str, BaseModel] = MappingProxyType({})
 ) -> tuple[str, DatasetReader]:
     """Return name and reader of ``data.type``, or of the first that recognizes the folder.
 
@@ -59,7 +59,7 @@ def find_reader(
         ) from None
     is_auto = config.type == "auto"
     if is_auto:
-        candidates = [*map(READERS.get, READERS.shipped_names), *READERS.installed_extensions()]
+        candidates = sorted(READERS.all(), key=lambda reader: reader.value.order)
     else:
         candidates = [READERS.get(config.type, "data.type")]
     for extension in candidates:
@@ -76,7 +76,7 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
     """
     overrides, where = list(overrides), str(folder)
     given = config_from({"data": {"path": folder}}, where, overrides)
-    layout, reader = find_reader(given.data, given.extensions)
+    layout, reader = find_reader(given.data, given.sections)
     sizes = [image_size(file) for file in reader.image_files(given.data)]
     width, height = max(sizes, key=lambda size: (math.prod(size), size[1]))
     data = {"path": folder, "type": layout, "image_size": _max_width(width, height, sizes)}

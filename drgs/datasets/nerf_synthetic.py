@@ -44,6 +44,8 @@ UNUSED_KEYS = ("camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h")
 class NerfSyntheticReader(DatasetReader):
     """Reads folders of NeRF-synthetic."""
 
+    order = 0
+
     @override
     def recognizes(self, folder: Path) -> bool:
         return (folder / "transforms_train.json").exists()

@@ -28,6 +28,8 @@ POINT_CLOUD = FileKind(
 class NerfstudioReader(DatasetReader):
     """Reads folders of nerfstudio and instant-ngp."""
 
+    order = 1
+
     @override
     def recognizes(self, folder: Path) -> bool:
         return (folder / "transforms.json").exists()

@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from pydantic import BaseModel
@@ -88,6 +88,9 @@ class Photographs:
 
 class DatasetReader:
     """Base class of readers of a layout of folders."""
+
+    order: ClassVar[int] = 9
+    """Readers are asked in ascending order whether they recognize a folder."""
 
     def __init__(self, section: BaseModel | None) -> None:
         """section: the one that the reader has registered, or None."""

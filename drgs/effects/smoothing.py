@@ -15,16 +15,21 @@ integral over the film (section 5).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING, cast
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
+from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import Approximations
+from drgs.config.extensions import EFFECTS
 from drgs.core.arrays import types_of
 from drgs.core.types import Array3f, Float, TensorXf
+from drgs.effects.base import SimulatedEffect, TrainingEffect, antialiasing_effect
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import (
     GaussianRows,
@@ -33,6 +38,11 @@ from drgs.splatting.projection import (
     plain_opacity,
     project,
 )
+
+if TYPE_CHECKING:
+    from drgs.config.schema import FitConfig
+    from drgs.datasets.types import Dataset
+    from drgs.training.views import FitState
 
 FILTER_VARIANCE = 0.2
 """Variance of the filter, in squared distances between samples (Mip-Splatting, equation 9)."""
@@ -76,6 +86,59 @@ def _rates(points: Array3f, camera: Camera) -> Float:
     # Written such that NaN is not seen.
     seen &= (film.x == film.x) & (film.y == film.y) & ~(beside.x | beside.y)
     return dr.select(seen, dr.max(camera.lens.focal_lengths(camera)) / depth, 0)
+
+
+UPDATE_EVERY = 100
+"""Iterations (as in Mip-Splatting's code); also where another stage begins, and after each change
+of the population."""
+
+
+@EFFECTS.register("smoothing")
+class TrainingSmoothing(TrainingEffect):
+    """The filter, computed from the training cameras at the image size in use."""
+
+    order = 50  # places the sensors of all views
+    by_row = frozenset({"filter"})
+
+    @classmethod
+    @override
+    def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:
+        return config.model.smoothing
+
+    @classmethod
+    @override
+    def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
+        keys = ("model.antialiased", "model.smoothing")
+        given = (config.model.antialiased, config.model.smoothing)
+        why = (key if is_given else None for key, is_given in zip(keys, given, strict=True))
+        return [antialiasing_effect(*why)]
+
+    def __init__(self) -> None:
+        self.filter: Float | None = None
+
+    @override
+    def begin(self, fit: FitState) -> None:
+        is_due = any(iteration % UPDATE_EVERY == 1 for iteration in fit.iterations_of_step)
+        if self.filter is None or fit.begins_phase or is_due:
+            self.filter = smoothing_of(fit.means, fit.cameras())
+        fit.integrator.smoothing = self.filter
+
+    @override
+    def finish(self, fit: FitState) -> None:
+        """Set the filter of the current means; the fit continues with the previous one."""
+        fit.integrator.smoothing = smoothing_of(fit.means, fit.cameras())
+
+    @override
+    def on_population_change(self, fit: FitState) -> None:
+        self.filter = fit.integrator.smoothing = None
+
+    @override
+    def state(self) -> dict[str, np.ndarray]:
+        return {} if self.filter is None else {"filter": np.array(self.filter)}
+
+    @override
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        self.filter = cast(Float, mi.Float(state["filter"])) if "filter" in state else None
 
 
 def bake_smoothing(gaussians: Gaussians) -> Gaussians:

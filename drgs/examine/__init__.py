@@ -1,4 +1,4 @@
-"""``drgs examine``: the effects that photographs need, and the function ``drgs.examine``.
+"""Find out which effects photographs need.
 
 Python gives ``drgs.examine`` to this package as soon as one of its modules is imported: so the
 package can be called, and stands for :func:`drgs.examine.examination.examine`.

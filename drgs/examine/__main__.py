@@ -11,12 +11,13 @@ from collections.abc import Sequence
 
 from drgs.cli.commands import CommandParser, file_or_folder, run_command
 from drgs.cli.execution import add_execution_arguments, execution_settings, select_variant
+from drgs.cli.progress import StepProgress
 from drgs.config.load import load_config
 from drgs.config.section import format_value
 from drgs.core.environment import VARIANTS
 from drgs.datasets import load_dataset
 from drgs.datasets.folders import config_for
-from drgs.examine.examination import examine, show_progress
+from drgs.examine.examination import examine
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -49,11 +50,11 @@ def run(args: argparse.Namespace) -> None:
     else:
         config = load_config(args.config, args.overrides)
     with execution_settings(args.threads, args.debug):
-        dataset = load_dataset(config.data_for_training, sections=config.extensions)
+        dataset = load_dataset(config.data_for_training, sections=config.sections)
         print(dataset.description)
         select_variant(args.variant or VARIANTS[0])
-        with show_progress() as progress:
-            examination = examine(dataset, config, progress)
+        with StepProgress("examining: ") as steps:
+            examination = examine(dataset, config, steps.update)
     print(examination)
     if changes := examination.changes:
         words = ["drgs", "fit", str(args.config)]

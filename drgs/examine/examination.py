@@ -1,7 +1,7 @@
 """Effects that a dataset needs, chosen by measurement: :func:`examine`.
 
 A short fit leaves some training photographs out. What they differ by from its renderings shows
-which effects are likely (:class:`drgs.training.findings.Finding`); each of these is simulated in a
+which effects are likely (:class:`drgs.effects.base.Finding`); each of these is simulated in a
 short fit of its own, and chosen if the photographs that were left out are matched better. Test
 photographs are not looked at.
 """
@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import cast
@@ -24,19 +23,18 @@ from scipy.special import stdtrit
 from typing_extensions import override
 
 from drgs.cli.execution import select_variant
-from drgs.cli.progress import StepProgress
 from drgs.config.changes import given_keys, with_changes, with_iterations
-from drgs.config.extensions import EFFECTS
+from drgs.config.extensions import EFFECTS, EXAMINERS
 from drgs.config.load import config_from
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError, one_line
 from drgs.datasets.images import smaller_view, with_arrays
 from drgs.datasets.types import Dataset, View, evenly_spaced
+from drgs.effects.base import Finding, Progress, ShortFit
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import Start, gaussians_at, start_of
 from drgs.results.alignment import align
-from drgs.training.findings import Finding, ShortFit
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.trainer import Trainer
 
@@ -60,14 +58,8 @@ BORDER_PX, BORDER_TOLERANCE, MIN_BORDER_SHARE = 2, 0.04, 0.6
 """A background of one colour: of each photograph's border, this share has it, but for this."""
 
 
-Progress = Callable[[str, int, int], None]  # what is tried, iterations done, and of how many
-
-
-@contextmanager
-def show_progress() -> Iterator[Progress]:
-    """Show the progress of an examination on the terminal, within the block."""
-    with StepProgress("examining: ") as steps:
-        yield steps.update
+def _show_nothing(what: str, done: int, total: int) -> None:
+    del what, done, total
 
 
 @dataclass(frozen=True)
@@ -133,6 +125,7 @@ class Examination:
         )
 
 
+@EXAMINERS.register("short_fits")
 def examine(
     dataset: Dataset,
     config: FitConfig | Mapping[str, object] | None = None,
@@ -145,7 +138,7 @@ def examine(
     examined, and ``note`` says so. Activates the Mitsuba variant ``llvm_ad_rgb`` where none is
     active.
 
-    Effects look for themselves: ``drgs.training.effects.base.TrainingEffect.look_for``.
+    Effects look for themselves: ``drgs.effects.base.TrainingEffect.look_for``.
     """
     started = time.perf_counter()
     if not isinstance(config, FitConfig):
@@ -267,7 +260,7 @@ def _fewer(start: Start) -> Start:
 
 def _shorten(config: FitConfig) -> FitConfig:
     iterations = min(MAX_ITERATIONS, round(SHARE_OF_ITERATIONS * config.iterations))
-    goal = config.densify.budget.gaussians or NUM_GAUSSIANS
+    goal = getattr(config.densify.settings, "gaussians", None) or NUM_GAUSSIANS
     changes = {
         "densify.strategy": "budget",
         "densify.budget.gaussians": min(goal, NUM_GAUSSIANS),
@@ -291,11 +284,9 @@ def with_background(dataset: Dataset, config: FitConfig) -> Dataset:
 
 def _findings(fit: ShortFit) -> list[Finding]:
     """Return the findings of what is shipped and of installed extensions."""
-    looks = [_look_for_background]
-    names = [*EFFECTS.shipped_names, *(e.name for e in EFFECTS.installed_extensions())]
-    looks += [EFFECTS.get(name).value.look_for for name in names]
-    findings = [look(fit) for look in looks]
-    return [finding for finding in findings if finding is not None]
+    effects = sorted((extension.value for extension in EFFECTS.all()), key=lambda e: e.order)
+    found = [look(fit) for look in (_look_for_background, *(e.look_for for e in effects))]
+    return [finding for finding in found if finding is not None]
 
 
 def _look_for_background(fit: ShortFit) -> Finding | None:

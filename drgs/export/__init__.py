@@ -1,4 +1,6 @@
-"""``drgs export``: finished Gaussians for other programs, cleaned, decimated, or as a mesh.
+"""Write Gaussians for other programs.
+
+They may be cleaned, decimated, merged, or made a mesh before.
 
 May import everything but other commands.
 """

@@ -1,4 +1,6 @@
-"""``drgs fit``: a fit from its configuration to its files, and :func:`drgs.train`.
+"""Fit 3D Gaussians to posed photographs.
+
+A fit from its configuration to its files, and :func:`drgs.train`.
 
 May import everything but other commands.
 """

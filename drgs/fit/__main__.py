@@ -180,7 +180,7 @@ def add_observers(
         from drgs.live_page.server import url
 
         trainer = session.trainer
-        viewer, session.criterion = watch(server, trainer, trainer.dataset, session.criterion)
+        viewer, session.continues = watch(server, trainer, trainer.dataset, session.continues)
         session.observers.append(viewer)
         print(f"live view: {url(server)}", flush=True)
 

@@ -2,10 +2,11 @@
 
 ``scenes/studies/training.py`` measures quality over time on the shipped scene: a curve for each
 :class:`Strategy`, in the time of an iteration at the start of a fit, with full images and the first
-Gaussians. A few iterations of the planned fit convert it to seconds, and the strategy whose curve
-is highest at the deadline is chosen. Curves of another scene predict a time to some ten or twenty
-per cent, so the clock revises the rest of the plan and ends the fit (:class:`Deadline`). The
-resulting configuration gives the same bytes without a clock.
+Gaussians. A rehearsal of the planned fit converts it to seconds, and the strategy whose curve is
+highest at the deadline is chosen. Curves of another scene predict a time to some ten or twenty per
+cent, so the clock ends the fit (:func:`deadline`): it cuts the last phase, when rates are small,
+or appends iterations at the final rates. The resulting configuration gives the same bytes without a
+clock.
 """
 
 from __future__ import annotations
@@ -19,25 +20,23 @@ from argparse import ArgumentTypeError
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
-from typing_extensions import override
 
 from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.datasets.types import Dataset
+from drgs.effects.base import TrainingEffect
 from drgs.fit.inputs import share_inputs
-from drgs.fit.loop import StopCriterion
+from drgs.fit.loop import Continues
 from drgs.fit.memory import room_for_targets
-from drgs.fit.report import seconds_of_curves, seconds_of_results
+from drgs.fit.report import seconds_of_results
 from drgs.gaussians.parameters import Gaussians
 from drgs.training.density.strategy import DensityStrategy
-from drgs.training.effects.base import TrainingEffect
 from drgs.training.losses import Loss
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import Trainer
@@ -48,10 +47,13 @@ MIN_ITERATIONS = 50  # fewer fit nothing
 
 MIN_SIDE_PX = 32  # images of coarse stages are not smaller than SSIM's windows need
 
-WARM_UP_ITERATIONS, TIMED_ITERATIONS, REHEARSAL_VIEWS = 6, 20, 8
-"""Iterations of a rehearsal, the first of which compile kernels; and its views."""
+WARM_UP_ITERATIONS, MIN_TIMED_ITERATIONS, REHEARSAL_VIEWS = 6, 20, 8
+"""Iterations of a rehearsal: those that compile kernels, and the fewest that are timed; its views.
+"""
 
-REVISION_SHARE = 0.1  # share of the time between two revisions of a plan
+REHEARSAL_SHARE, MAX_REHEARSAL_S = 0.03, 10.0  # of the time: what a rehearsal may take, at most
+
+NEVER = 1_000_000_000  # an iteration after all
 
 MAX_IMAGES_SHARE = 0.33
 """Share of the time that ``--budget`` leaves: images that take more are left out."""
@@ -65,6 +67,11 @@ class Budget:
 
     seconds: float  # as the user gave it
     end: float  # by time.perf_counter
+
+    @property
+    def rehearsal_s(self) -> float:
+        """Seconds of a rehearsal."""
+        return min(REHEARSAL_SHARE * self.seconds, MAX_REHEARSAL_S)
 
 
 @dataclass(frozen=True)
@@ -126,11 +133,6 @@ class Curve:
         log_n = _interpolate(math.log(time), np.log(self.time), np.log(self.iterations))
         return math.floor(math.exp(log_n) + 1e-9)
 
-    def time_of(self, iterations: int) -> float:
-        """Return the time of a number of iterations."""
-        log_time = _interpolate(math.log(iterations), np.log(self.iterations), np.log(self.time))
-        return math.exp(log_time)
-
     def psnr_at(self, iterations: int) -> float:
         """Return the PSNR after a number of iterations."""
         return _interpolate(math.log(iterations), np.log(self.iterations), self.psnr)
@@ -159,7 +161,6 @@ class Candidate:
     """A strategy, and the iterations and the PSNR that a given time allows."""
 
     strategy: Strategy
-    curve: Curve
     iterations: int
     psnr: float  # dB, on the shipped scene
 
@@ -198,7 +199,7 @@ def make_plan(
             iterations = curve.iterations_in(seconds / start_s) if seconds > 0 else 0
             if iterations >= MIN_ITERATIONS:
                 psnr = curve.psnr_at(iterations)
-                candidates.append(Candidate(strategy, curve, iterations, psnr))
+                candidates.append(Candidate(strategy, iterations, psnr))
     if not candidates:
         raise UserError(
             f"--budget: must leave time for {MIN_ITERATIONS} iterations, got "
@@ -221,6 +222,7 @@ def make_plan(
         ),
         f"Planned: {planned.iterations:,} iterations; {sizes}; at most {most:,} "
         f"Gaussians; the population changes until iteration {planned.densify.stop:,}.",
+        "The fit ends when the time is up, some iterations earlier or later.",
     ]
     return Plan(planned, chosen, tuple(candidates), "\n".join(reasons))
 
@@ -233,8 +235,9 @@ def rehearse(
     density: DensityStrategy | None = None,
     effects: Sequence[TrainingEffect] = (),
     loss: Loss | None = None,
+    seconds: float = 0.0,
 ) -> tuple[Trainer, float]:
-    """Run a few iterations on a few of the views; return their trainer, and seconds of one.
+    """Run iterations on a few of the views, for some seconds; return their trainer, and one's time.
 
     An iteration has full images and the first Gaussians. The arguments are those of
     :class:`Trainer`; configuration and dataset are None on other ranks than 0.
@@ -245,23 +248,28 @@ def rehearse(
         count = max(REHEARSAL_VIEWS, views_per_step)
         views = dataset.train[:: max(1, len(dataset.train) // count)][:count]
         dataset = replace(dataset, train=views)
-        never = config.iterations + (WARM_UP_ITERATIONS + TIMED_ITERATIONS) * views_per_step
-        still = {"densify.start": never, "densify.stop": never + 1, "densify.prune.to": None}
+        still = {"densify.start": NEVER, "densify.stop": NEVER + 1, "densify.prune.to": None}
         config = with_changes(config, {"coarse": [], **still})
     config, dataset = share_inputs(comm, config, dataset)
     objects = deepcopy((density, effects, loss))
-    room = partial(room_for_targets, config, dataset, gaussians, comm)
+    room = room_for_targets(config, dataset, gaussians.num_gaussians, comm)
     trainer = Trainer(config, dataset, gaussians, comm, *objects, room=room)
     views_per_step = config.optimizer.views_per_step
-    # Steps of several views are fewer.
-    warm_up, timed = (
-        max(2, math.ceil(n / views_per_step)) for n in (WARM_UP_ITERATIONS, TIMED_ITERATIONS)
-    )
-    for count in (warm_up, timed):
-        start = time.perf_counter()
-        reports = [trainer.step() for _ in range(count)]
-        _ = reports[-1].loss  # waits for the device
-    return trainer, (time.perf_counter() - start) / (timed * views_per_step)
+    least = math.ceil(MIN_TIMED_ITERATIONS / views_per_step)
+    run_steps(trainer, max(2, math.ceil(WARM_UP_ITERATIONS / views_per_step)))
+    step_s = run_steps(trainer, max(2, least)) / max(2, least)
+    more = int(comm.broadcast_numbers(math.floor(seconds / step_s)))
+    if more > least:
+        step_s = run_steps(trainer, more) / more
+    return trainer, step_s / views_per_step
+
+
+def run_steps(trainer: Trainer, count: int) -> float:
+    """Run some steps of a trainer; return their seconds."""
+    start = time.perf_counter()
+    reports = [trainer.step() for _ in range(count)]
+    _ = reports[-1].loss  # waits for the device
+    return time.perf_counter() - start
 
 
 def plan_fit(
@@ -279,7 +287,7 @@ def plan_fit(
     num_points, most = gaussians.num_gaussians, target_of(config) or 0
     results = seconds_of_results(scene, dataset, max(num_points, most), config.model.sh_degree)
     images = results.renders if config.output.save_renders else 0.0
-    images += results.report + seconds_of_curves() if config.output.report else 0.0
+    images += results.report if config.output.report else 0.0
     if images > MAX_IMAGES_SHARE * (end - time.perf_counter()):
         note = (
             "--budget: the time is needed for iterations: no report, orbit and images are "
@@ -302,43 +310,13 @@ def plan_fit(
     return replace(plan, end=end)
 
 
-class Deadline(StopCriterion):
-    """Ends a fit when its time is up.
+def deadline(end: float, comm: Communicator) -> Continues:
+    """Let a fit run until ``end``, by ``time.perf_counter`` of rank 0."""
 
-    Ten times during the fit, the curve is scaled to the time taken so far, and the fit gets another
-    number of iterations, and changes of the population the same share of it.
-    """
+    def is_time_left(trainer: Trainer) -> bool:
+        return bool(comm.broadcast_numbers(time.perf_counter() < end or trainer.iteration == 0))
 
-    def __init__(self, trainer: Trainer, end: float, curve: Curve) -> None:
-        """end: when the last iteration is to end, by ``time.perf_counter``."""
-        self._curve, config = curve, trainer.config
-        self._start, self._end = time.perf_counter(), end
-        self._next = self._start + REVISION_SHARE * (end - self._start)
-        self._densify_share = config.densify.stop / config.iterations
-
-    @override
-    def should_continue(self, trainer: Trainer) -> bool:
-        now, done = time.perf_counter(), trainer.iteration
-        if now >= self._end and done > 0:
-            trainer.reschedule(done, trainer.config.densify.stop)
-            return False
-        if now >= self._next and done > 0:
-            self._next = now + REVISION_SHARE * (self._end - self._start)
-            total, densify = self.num_iterations(trainer), trainer.config.densify
-            stop = densify.stop
-            if done < stop:
-                stop = max(round(self._densify_share * total), done + 1, densify.start + 1)
-            trainer.reschedule(total, stop)
-        return True
-
-    @override
-    def num_iterations(self, trainer: Trainer) -> int:
-        now, done = time.perf_counter(), trainer.iteration
-        if done == 0:
-            return trainer.config.iterations
-        ratio = (self._end - self._start) / max(now - self._start, 1e-9)
-        total = self._curve.iterations_in(self._curve.time_of(done) * max(ratio, 1.0))
-        return max(total, done + 1) if now < self._end else done
+    return is_time_left
 
 
 _NUMBER = r"(\d+(?:\.\d+)?)"

@@ -1,8 +1,4 @@
-"""Checkpoints: a fit that was stopped continues to the bytes that it would have given.
-
-``checkpoint.npz`` is written atomically, and ``config.yml`` after it. Since a process may end
-between the two, it also contains the configuration before the last revision of the plan.
-"""
+"""Checkpoints: a fit that was stopped continues to the bytes that it would have given."""
 
 from __future__ import annotations
 
@@ -21,7 +17,7 @@ from drgs.core.errors import UserError, format_names, one_line
 from drgs.core.files import atomic_path, read_arrays, refusal_reason
 from drgs.fit.fingerprint import Fingerprint
 from drgs.results.files import CHECKPOINT, CONFIG
-from drgs.results.folder import load_run_config, write_run_config
+from drgs.results.folder import write_run_config
 from drgs.results.history import DENSITY_COLUMNS, HistoryRow
 from drgs.training.trainer import DENSITY
 
@@ -48,14 +44,9 @@ class Checkpoint:
 
 
 def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> None:
-    """Write or replace the checkpoint of an output folder, and ``config.yml`` if it is revised."""
-    try:
-        before = load_run_config(folder)
-    except UserError:  # there is none, or the user is just editing it
-        before = config
+    """Write or replace the checkpoint of an output folder, atomically, and a missing config.yml."""
     arrays = {
         "config": np.array(_as_text(config)),
-        "config_before": np.array(_as_text(before)),
         "history": checkpoint.history,
         "density": checkpoint.density,
         "wall_s": np.array(checkpoint.wall_s),
@@ -64,7 +55,7 @@ def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> 
     }
     with atomic_path(folder / CHECKPOINT) as temporary:
         np.savez(temporary, **arrays)  # pyright: ignore[reportArgumentType]  # allow_pickle=
-    if before != config or not (folder / CONFIG).is_file():
+    if not (folder / CONFIG).is_file():
         write_run_config(folder, config)
 
 
@@ -78,10 +69,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
         return None
     try:
         arrays = read_arrays(path, "checkpoint")
-        own, before = (
-            _match_leaves(config, json.loads(str(arrays.pop(name))))
-            for name in ("config", "config_before")
-        )
+        own = _match_leaves(config, json.loads(str(arrays.pop("config"))))
         checkpoint = Checkpoint(
             history=arrays.pop("history"),
             density=arrays.pop("density"),
@@ -96,7 +84,7 @@ def load_checkpoint(folder: Path, config: FitConfig) -> Checkpoint | None:
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise _damaged_error(path, error) from None
     # A value that one leaves to the dataset is taken from the other.
-    if all(with_decisions(config, past) != with_decisions(past, config) for past in (own, before)):
+    if with_decisions(config, own) != with_decisions(own, config):
         raise UserError(
             f"{path}: belongs to another configuration than {folder / CONFIG}; {_remedy(path)}"
         )
@@ -125,10 +113,8 @@ def check_fits(folder: Path, checkpoint: Checkpoint, start: Mapping[str, np.ndar
             _check_shape(name, state[name], *expected[name])
             _check_finite(name, state[name])
         iteration = int(state["iteration"])
-        if not 0 <= iteration <= config.iterations:
-            raise ValueError(
-                f"iteration must be between 0 and {config.iterations:,}, got {iteration:,}"
-            )
+        if iteration < 0:
+            raise ValueError(f"iteration must be >= 0, got {iteration:,}")
     except ValueError as error:
         raise _damaged_error(folder / CHECKPOINT, error) from None
 
@@ -165,18 +151,19 @@ def _remedy(path: Path) -> str:
 
 
 def _as_text(config: FitConfig) -> str:
-    """Return every value but where the output goes and how often it is written."""
-    return json.dumps(config.model_dump(mode="json", exclude={"output"}), sort_keys=True)
+    """Return every value but where the output goes, how often it is written, and the last one."""
+    values = config.model_dump(mode="json", exclude={"output", "stop_after"})
+    return json.dumps(values, sort_keys=True)
 
 
 def _match_leaves(config: FitConfig, values: Mapping[str, object]) -> FitConfig:
-    """Return a checkpoint's configuration, with places and the section ``output`` of another."""
+    """Return a checkpoint's configuration, with places, ``output`` and the end of another."""
     places = {}
     for key in PLACE_KEYS:
         section, name = key.split(".")
         places[key] = getattr(getattr(config, section), name)
-    output = config.output.model_dump()
-    return with_changes(FitConfig.model_validate({**values, "output": output}), places)
+    others = {"output": config.output.model_dump(), "stop_after": config.stop_after}
+    return with_changes(FitConfig.model_validate({**values, **others}), places)
 
 
 def _shape(name: str, start: Mapping[str, np.ndarray], num: int) -> tuple[int, ...]:

@@ -15,14 +15,14 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.config.approximations import Approximations
-from drgs.config.changes import with_changes
+from drgs.config.changes import given_keys, with_changes
 from drgs.config.schema import FitConfig
 from drgs.core.environment import processor
 from drgs.core.errors import UserError
-from drgs.core.files import atomic_path
+from drgs.core.files import atomic_path, write_json
 from drgs.core.folders import sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
-from drgs.examine.examination import Examination, given_keys
+from drgs.effects.base import ChosenEffects
 from drgs.fit.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.fit.inputs import versions
 from drgs.fit.loop import History
@@ -91,7 +91,7 @@ class FitFolder:
         with atomic_path(self.path / files.BUDGET_PLAN) as temporary:
             temporary.write_text(text)
 
-    def write_examination(self, examination: Examination) -> None:
+    def write_examination(self, examination: ChosenEffects) -> None:
         """Write what was chosen, and why."""
         with atomic_path(self.path / files.EXAMINATION) as temporary:
             temporary.write_text(examination.to_json())
@@ -170,7 +170,7 @@ class FitFolder:
     ) -> FitMetrics:
         known = versions()
         return {
-            "iterations": config.iterations,
+            "iterations": config.last_iteration,
             "num_gaussians": num_gaussians,
             "wall_s": round(wall_s, 2),
             "test": test,
@@ -210,8 +210,7 @@ class FitFolder:
     def finish(self, metrics: FitMetrics | None = None) -> None:
         """Write ``metrics.json`` (None: it exists), and end the run by removing the checkpoint."""
         if metrics is not None:
-            with atomic_path(self.path / files.METRICS) as temporary:
-                temporary.write_text(json.dumps(metrics, indent=2) + "\n")
+            write_json(self.path / files.METRICS, metrics, indent=2)
         remove_checkpoint(self.path)
         folder.seal_run(self.path)
 

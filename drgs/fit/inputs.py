@@ -50,7 +50,7 @@ def share_inputs(
     config = FitConfig.model_validate_json(text)
     own = own_views(len(names), config.optimizer.views_per_step, comm.rank, comm.size)
     rendered = {names[index] for index in own}
-    dataset = load_dataset(config.data_for_training, rendered.__contains__, config.extensions)
+    dataset = load_dataset(config.data_for_training, rendered.__contains__, config.sections)
     chosen = set(names)
     dataset = replace(dataset, train=tuple(view for view in dataset.train if view.name in chosen))
     check_views(comm, dataset, rendered, config.data.path)

@@ -14,7 +14,7 @@ import numpy as np
 from typing_extensions import override
 
 from drgs.datasets.types import Dataset
-from drgs.fit.loop import History, Iteration, Observer, StopCriterion, exponential_mean
+from drgs.fit.loop import Continues, History, Iteration, Observer, exponential_mean
 from drgs.live_page.frames import LiveScene
 from drgs.live_page.page import Page, StartView, event_handler
 from drgs.live_page.scheduler import RenderRequests, RenderScheduler
@@ -43,25 +43,9 @@ CURVES: dict[str, uplot.Series] = {
 }  # by title
 
 
-class EarlyStop(StopCriterion):
-    """The stop criterion ``criterion``, or a viewer client's request to end."""
-
-    def __init__(self, criterion: StopCriterion, requests: RenderRequests) -> None:
-        self._criterion, self._requests = criterion, requests
-
-    @override
-    def should_continue(self, trainer: Trainer) -> bool:
-        done = trainer.iteration
-        if self._requests.ended and 0 < done < trainer.config.iterations:
-            stop = trainer.config.densify.stop
-            assert stop is not None, "a configuration sets it"
-            trainer.reschedule(done, stop)
-            return False
-        return self._criterion.should_continue(trainer)
-
-    @override
-    def num_iterations(self, trainer: Trainer) -> int:
-        return self._criterion.num_iterations(trainer)
+def unless_ended(continues: Continues, requests: RenderRequests) -> Continues:
+    """Also end a fit where a viewer client has asked for it."""
+    return lambda trainer: not (requests.ended and trainer.iteration > 0) and continues(trainer)
 
 
 class TrainingViewer(Observer):
@@ -72,9 +56,8 @@ class TrainingViewer(Observer):
         requests: RenderRequests,
         page: TrainingPage,
         dataset: Dataset,
-        criterion: StopCriterion,
     ) -> None:
-        self._requests, self._page, self._criterion = requests, page, criterion
+        self._requests, self._page = requests, page
         self._background = dataset.background
         self._scheduler = RenderScheduler(
             requests, page.show, page.refuse, lambda s: max(REFRESH_SECONDS, s / REFRESH_SHARE)
@@ -93,7 +76,7 @@ class TrainingViewer(Observer):
         is_due = self._requests.pending and now - self._progress_at >= PROGRESS_SECONDS
         if history.rows and (is_due or done.is_last):
             self._progress_at = now
-            self._page.show_progress(trainer, history, self._criterion.num_iterations(trainer))
+            self._page.show_progress(trainer, history)
         self._serve(trainer)
         while self._requests.paused and not (self._requests.ended or done.is_last or stops()):
             if not self._serve(trainer):
@@ -138,9 +121,10 @@ class TrainingPage(Page):
         self._room = 0  # range of their x axis, iterations
         self._folder = gui.add_folder("PSNR [dB]")
 
-    def show_progress(self, trainer: Trainer, history: History, total: int) -> None:
-        """Show the progress without synchronizing; total: number of iterations."""
+    def show_progress(self, trainer: Trainer, history: History) -> None:
+        """Show the progress without synchronizing."""
         last, done = history.rows[-1], trainer.iteration
+        total = max(done, trainer.config.last_iteration)  # a clock may end the fit later
         psnr = exponential_mean([row.psnr for row in history.rows])
         self._status.content = (
             f"**{done:,}** of {total:,} iterations, {last.iteration / max(last.wall_s, 1e-9):.1f} "
@@ -149,8 +133,7 @@ class TrainingPage(Page):
         )
         self._bar.value = min(100.0, 100.0 * done / max(total, 1))
         curves = psnr_curves(history.rows)
-        if not self._room / CURVE_ROOM**2 <= total <= self._room:
-            # A budget plan may revise the total twice a second; redraw charts only if needed.
+        if total > self._room:
             self._room = round(CURVE_ROOM * total) if self._charts else total
             self._draw(curves)
         for chart, curve in zip(self._charts, curves, strict=True):
@@ -203,17 +186,14 @@ class TrainingPage(Page):
 
 
 def watch(
-    server: viser.ViserServer, trainer: Trainer, dataset: Dataset, criterion: StopCriterion
-) -> tuple[TrainingViewer, StopCriterion]:
-    """Show a fit on the server's page; return the observer that serves it, and its criterion."""
-    requests, start = (
-        RenderRequests(),
-        StartView.from_views(dataset.train).move_back(START_DISTANCE_FACTOR),
-    )
-    criterion = EarlyStop(criterion, requests)
+    server: viser.ViserServer, trainer: Trainer, dataset: Dataset, continues: Continues
+) -> tuple[TrainingViewer, Continues]:
+    """Show a fit on the server's page; return the observer that serves it, and its end."""
+    requests = RenderRequests()
+    start = StartView.from_views(dataset.train).move_back(START_DISTANCE_FACTOR)
     page = TrainingPage(server, requests, start, trainer.config.model.approximations)
     page.add_cameras(dataset.train, visible=True)
-    return TrainingViewer(requests, page, dataset, criterion), criterion
+    return TrainingViewer(requests, page, dataset), unless_ended(continues, requests)
 
 
 def psnr_curves(rows: Sequence[HistoryRow]) -> list[Curve]:

@@ -12,10 +12,10 @@ from typing import Protocol
 import numpy as np
 from typing_extensions import override
 
+from drgs.config.changes import with_changes
 from drgs.datasets.types import View, evenly_spaced
 from drgs.results.history import DENSITY_COLUMNS, DensityReport, DensityRow, FitHistory, HistoryRow
 from drgs.results.metrics import psnr
-from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import StepReport, Trainer
 
 PSNR_SMOOTHING = 0.9  # weight of the past in the PSNR of training views
@@ -94,40 +94,13 @@ def exponential_mean(values: Iterable[float]) -> np.ndarray:
     return np.fromiter(accumulate(values, smoother), np.float64)
 
 
-class StopCriterion:
-    """Ends a fit after the iterations of its configuration; subclasses decide otherwise."""
-
-    def should_continue(self, trainer: Trainer) -> bool:
-        """Return whether to run another iteration; may revise the trainer's configuration."""
-        return trainer.iteration < trainer.config.iterations
-
-    def num_iterations(self, trainer: Trainer) -> int:
-        """Return the number of iterations of the whole fit, as expected now."""
-        return trainer.config.iterations
+Continues = Callable[[Trainer], bool]
+"""Returns whether a fit runs another step; all ranks call it."""
 
 
-@dataclass(frozen=True)
-class RootDecides(StopCriterion):
-    """Ends a fit, and revises it, on all ranks as the criterion of rank 0 does there."""
-
-    criterion: StopCriterion  # of other ranks: is not consulted
-    comm: Communicator
-
-    @override
-    def should_continue(self, trainer: Trainer) -> bool:
-        before, continues = trainer.config, True
-        if self.comm.is_root:
-            continues = self.criterion.should_continue(trainer)
-        config, is_revised = trainer.config, trainer.config is not before
-        decision = continues, is_revised, config.iterations, config.densify.stop
-        continues, is_revised, *plan = map(int, self.comm.broadcast_numbers(decision))
-        if is_revised and not self.comm.is_root:
-            trainer.reschedule(*plan)
-        return bool(continues)
-
-    @override
-    def num_iterations(self, trainer: Trainer) -> int:
-        return self.criterion.num_iterations(trainer)
+def until_planned_end(trainer: Trainer) -> bool:
+    """Return whether the iterations of the configuration are not done yet."""
+    return trainer.iteration < trainer.config.last_iteration
 
 
 @dataclass(frozen=True)
@@ -151,23 +124,33 @@ class Observer(Protocol):
         """
 
 
-def iterations(trainer: Trainer, history: History, criterion: StopCriterion) -> Iterator[Iteration]:
+def iterations(
+    trainer: Trainer, history: History, continues: Continues = until_planned_end
+) -> Iterator[Iteration]:
     """Run the remaining iterations: a generator, one step an item.
 
     Rows are added to ``history`` every ``output.history_every`` iterations, and for the last one.
     There, and at changes of the population, ``NonFiniteError`` is raised if a loss, a gradient or a
     value is not finite.
     """
-    continues = criterion.should_continue(trainer)
-    while continues:
+    is_last = _is_last(trainer, continues)
+    while not is_last:
         report, row = trainer.step(), None
         if report.density is not None:
             history.add_density(report.iteration, report.density)
-        continues = criterion.should_continue(trainer)
-        if not continues or report.passes(trainer.config.output.history_every):
+        is_last = _is_last(trainer, continues)
+        if is_last or report.passes(trainer.config.output.history_every):
             row = history.add(report)
             trainer.check_iterations()  # reading the row has waited for the device
-        yield Iteration(report, row, is_last=not continues)
+        yield Iteration(report, row, is_last)
+
+
+def _is_last(trainer: Trainer, continues: Continues) -> bool:
+    """Return whether a fit ends; one that ends otherwise than planned records where."""
+    is_last, config = not continues(trainer), trainer.config
+    if is_last and trainer.iteration != config.last_iteration:
+        trainer.config = with_changes(config, {"stop_after": trainer.iteration})
+    return is_last
 
 
 class HeldOutQuality(Observer):
@@ -175,7 +158,7 @@ class HeldOutQuality(Observer):
 
     def __init__(self, views: Sequence[View]) -> None:
         """views: test views; none on other ranks than 0."""
-        self._views = measured_views(views)
+        self._views = evenly_spaced(views, MAX_MEASURED_VIEWS)
 
     @override
     def after_iteration(
@@ -183,7 +166,7 @@ class HeldOutQuality(Observer):
     ) -> None:
         config = trainer.config
         is_row = done.row is not None and config.output.report
-        if is_row and measurement_is_due(history.rows, config.iterations):
+        if is_row and (done.is_last or measurement_is_due(history.rows, config.iterations)):
             self.measure(trainer, history)
 
     def measure(self, trainer: Trainer, history: History) -> None:
@@ -197,14 +180,9 @@ class HeldOutQuality(Observer):
         history.leave_out(time.perf_counter() - start)
 
 
-def measured_views(views: Sequence[View]) -> tuple[View, ...]:
-    """Return at most :data:`MAX_MEASURED_VIEWS` of the views, evenly spread."""
-    return evenly_spaced(views, MAX_MEASURED_VIEWS)
-
-
 def measurement_is_due(rows: Sequence[HistoryRow], iterations: int) -> bool:
     """Return whether the last of ``rows`` is to be measured; iterations: of the whole fit."""
-    last = rows[-1].iteration
     before = max((row.iteration for row in rows if row.test_psnr is not None), default=0)
-    every = max(MIN_ITERATIONS_BETWEEN, iterations // NUM_MEASUREMENTS)
-    return last >= iterations or last - before >= every
+    return rows[-1].iteration - before >= max(
+        MIN_ITERATIONS_BETWEEN, iterations // NUM_MEASUREMENTS
+    )

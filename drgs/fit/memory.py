@@ -1,32 +1,23 @@
 """Peak memory of a fit, estimated before it starts; fits that need too much are refused.
 
-The peak is that of an iteration with as many Gaussians as the configuration allows. Entries and
-slots of splats (see ``drgs.splatting``) are counted at the start, where splats are largest, for
-some of the views and Gaussians. The numbers of bytes below were fitted to measured peaks of
-resident memory, for 10,000 to 300,000 Gaussians and images of 100 x 100 to 1000 x 1000 px.
+The peak is that of an iteration with as many Gaussians as the configuration allows. The numbers of
+bytes below were fitted to measured peaks of resident memory, for 10,000 to 300,000 Gaussians and
+images of 100 x 100 to 1000 x 1000 px.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
-from drgs.cameras.viewpoints import Viewpoint
 from drgs.config.schema import FitConfig
-from drgs.core.constants import ALPHA_CUT, LOW_PASS, TRANSMITTANCE_STOP
 from drgs.core.errors import UserError
 from drgs.core.memory import available_memory, format_bytes, resident_memory
-from drgs.datasets.film import to_camera, to_film
-from drgs.datasets.images import shift_pixels
 from drgs.datasets.storage import is_on_disk
 from drgs.datasets.types import Dataset, View
-from drgs.gaussians.parameters import Gaussians
-from drgs.splatting.grid import MICRO, TILE
 from drgs.splatting.reduction import BAND_SLOTS
-from drgs.training.density.strategy import density_strategy
+from drgs.training.density.phases import density_strategy
 from drgs.training.parallel.communicator import Communicator
 
 PROCESS_BYTES = 290_000_000  # memory of interpreter, libraries, compiled kernels, and results
@@ -42,16 +33,13 @@ ENTRY_BYTES, SLOT_BYTES = 150, 36
 PIXEL_BYTES, MEASURED_BYTES = 155, 130
 """Memory of each pixel that is rendered; of each pixel of a test view that is measured."""
 
-FITTED_REACH = 0.55
-"""Reach of fitted Gaussians, in units of the root of (pixels per Gaussian): N Gaussians in P pixels
-have about N (1 + FITTED_REACH sqrt(P / N))^2 entries. Counted in fits of the shipped scene with
-23,000 and 114,000 Gaussians at 200 to 800 px: 0.42 to 0.57."""
+START_REACH, FITTED_REACH = 1.3, 0.55
+"""Reach of Gaussians, in units of the root of (pixels per Gaussian): N Gaussians in P pixels have
+about N (1 + reach sqrt(P / N))^2 entries. At the start of a fit 0.9 to 1.6 for random points, and
+0.4 on a hull; in fits of the shipped scene with 23,000 and 114,000 Gaussians at 200 to 800 px, 0.42
+to 0.57."""
 
-FITTED_SLOTS = 2.7  # slots of an entry of fitted Gaussians: 2.0 to 3.7 in the same fits
-
-COUNTED_VIEWS, COUNTED_GAUSSIANS = 8, 20_000  # estimates entries and slots to a few per cent
-
-MAX_RADIUS_PX = 1e6  # A larger radius covers any film
+SLOTS = 2.7  # of an entry of fitted Gaussians: 2.0 to 3.7 in the same fits; at the start 4 to 9
 
 AHEAD_BYTES = 120
 """Memory of each pixel of a view whose photograph is on disk: 12 of the iteration's and of each of
@@ -64,36 +52,27 @@ MIN_WIDTH_PX = 16  # no smaller images are advised
 
 @dataclass(frozen=True)
 class FitMemory:
-    """Bytes at the peak of a fit, by use."""
+    """Bytes at the peak of a fit, by use, without targets, which can be made anew."""
 
-    process: int
     photographs: int  # as stored
-    targets: int  # that would stay on the device if there were room for all
     gaussians: int
-    splats: int  # entries and slots
-    pixels: int
+    image: int  # pixels, entries and slots
 
     @property
     def required_bytes(self) -> int:
-        """The sum without targets, which can be made anew."""
-        return self.process + self.photographs + self.gaussians + self.splats + self.pixels
+        """The sum, with the process itself."""
+        return PROCESS_BYTES + self.photographs + self.gaussians + self.image
 
 
 def estimate(
-    config: FitConfig,
-    dataset: Dataset,
-    gaussians: Gaussians,
-    pixel_bytes: int,
-    scale: float = 1.0,
-    processes: int = 1,
+    config: FitConfig, dataset: Dataset, start: int, scale: float = 1.0, processes: int = 1
 ) -> FitMemory:
-    """Estimate the peak, in one process, of a fit that starts with ``gaussians``.
+    """Estimate the peak, in one process, of a fit that starts with ``start`` Gaussians.
 
-    pixel_bytes: see ``steps.bytes_per_pixel``; scale: of all images' width and height, for another
-    ``data.image_size``; processes: share the Gaussians, and each renders images of all of them.
+    scale: of all images' width and height, for another ``data.image_size``; processes: share the
+    Gaussians, and each renders images of all of them.
     """
     train, views = dataset.train, {*dataset.train, *dataset.test}
-    start = gaussians.num_gaussians
     count = max_num_gaussians(config, start)
     pixels = scale**2 * max(view.width * view.height for view in train)
     measured = scale**2 * max((view.width * view.height for view in dataset.test), default=0)
@@ -101,20 +80,18 @@ def estimate(
         view.motion.samples if view.motion is not None and view.motion.shutter == "global" else 1
         for view in train
     )
-
-    fitted = count * (1 + FITTED_REACH * math.sqrt(pixels / count)) ** 2
-    entries, slots = _bytes_at_start(train, gaussians, config.model.near_plane, scale)
-    entries, slots = max(entries, fitted), max(slots, FITTED_SLOTS * fitted)
+    entries = max(
+        number * (1 + reach * math.sqrt(pixels / number)) ** 2
+        for number, reach in ((start, START_REACH), (count, FITTED_REACH))
+    )
+    splats = ENTRY_BYTES * entries * times + SLOT_BYTES * min(SLOTS * entries, BAND_SLOTS)
     ahead = AHEAD_BYTES * pixels if any(map(is_on_disk, train)) else 0
     numbers = 11 + 3 * (config.model.sh_degree + 1) ** 2
     of_gaussian = NUMBER_BYTES * numbers + GAUSSIAN_BYTES + (GROWTH_BYTES if count > start else 0)
     return FitMemory(
-        process=PROCESS_BYTES,
         photographs=round(ahead + sum(_photograph_bytes(view, scale) for view in views)),
-        targets=round(scale**2 * pixel_bytes * sum(_target_pixels(view) for view in train)),
         gaussians=round(of_gaussian * count / processes),
-        splats=round(ENTRY_BYTES * entries * times + SLOT_BYTES * min(slots, BAND_SLOTS)),
-        pixels=round(PIXEL_BYTES * pixels * times + MEASURED_BYTES * measured),
+        image=round(splats + PIXEL_BYTES * pixels * times + MEASURED_BYTES * measured),
     )
 
 
@@ -123,86 +100,45 @@ def max_num_gaussians(config: FitConfig, start: int) -> int:
     return density_strategy(config).max_num_gaussians(start, config.iterations)
 
 
-def _target_pixels(view: View) -> int:
-    """Return the pixels of all targets that are made of a view."""
-    return len(shift_pixels(view)) * view.width * view.height
-
-
 def _photograph_bytes(view: View, scale: float) -> float:
     """Return the bytes of a view's images, or of the numbers of smaller ones if these take less."""
     images = [p for p in (view.image, view.alpha, view.mask, view.depth) if p is not None]
-    numbers = 4 * scale**2 * sum(math.prod(rendered.shape) for rendered in images)
-    return min(sum(rendered.nbytes for rendered in images), numbers)
+    numbers = 4 * scale**2 * sum(math.prod(image.shape) for image in images)
+    return min(sum(image.nbytes for image in images), numbers)
 
 
-@np.errstate(over="ignore")  # of scales beyond all images
-def _bytes_at_start(
-    views: Sequence[Viewpoint], gaussians: Gaussians, near: float, scale: float
-) -> tuple[float, float]:
-    """Count entries and slots of the view that has most, of some: splats taken as round."""
-    g = gaussians.numpy()
-    step = -(-g.num_gaussians // COUNTED_GAUSSIANS)
-    means, scales = g.means[::step].astype(np.float64), np.exp(g.log_scales[::step].mean(axis=1))
-    opacities = np.maximum(g.opacities[::step], 1.01 * ALPHA_CUT)
-    reach = np.sqrt(2 * np.log(opacities / ALPHA_CUT))
-    counts = []
-    for view in views[:: -(-len(views) // COUNTED_VIEWS)]:
-        u, v, z = to_film(view, to_camera(view, list(means.T)))
-        seen = z > near
-        z = np.where(seen, z, 1)
-        focal, size = scale * math.sqrt(view.fx * view.fy), np.array([view.width, view.height])
-        radius = np.minimum(reach * np.sqrt((focal * scales / z) ** 2 + LOW_PASS), MAX_RADIUS_PX)
-        tiles, boxes = seen.astype(np.float64), np.ones(len(z))
-        for center, length in zip((scale * u, scale * v), scale * size, strict=True):
-            inside = np.minimum(center + radius, length) - np.maximum(center - radius, 0)
-            tiles *= np.where(inside > 0, np.maximum(inside, 0) / TILE + 1, 0)
-            boxes *= np.maximum(inside, 0) / (2 * radius)
-        # Cells of a grid that a disc touches on average, and what of it is on the film.
-        micros = boxes * (np.pi * radius**2 + 4 * radius * MICRO + MICRO**2) / MICRO**2
-        alpha = (opacities - ALPHA_CUT) / np.log(opacities / ALPHA_CUT)  # mean over the disc
-        weights = np.where(seen, micros, 0)
-        total = float(weights.sum())
-        layers = -math.log(TRANSMITTANCE_STOP) * total / max(float((weights * alpha).sum()), 1e-9)
-        composited = layers * scale**2 * view.width * view.height / MICRO**2
-        counts.append((step * float(tiles.sum()), min(step * total, composited)))
-    return max(entries for entries, _ in counts), max(slots for _, slots in counts)
+def room_for_targets(config: FitConfig, dataset: Dataset, start: int, comm: Communicator) -> int:
+    """Return the bytes of targets that may stay on the device; start: Gaussians at the start.
 
-
-def room_for_targets(
-    config: FitConfig,
-    dataset: Dataset,
-    gaussians: Gaussians,
-    comm: Communicator,
-    pixel_bytes: int,
-) -> int:
-    """Return the bytes of targets that may stay on the device; pixel_bytes: see :func:`estimate`.
-
-    Raises :class:`UserError` where the fit would not fit into memory.
+    Raises :class:`UserError`, on all ranks, where the fit would not fit into memory.
     """
-    memory = estimate(config, dataset, gaussians, pixel_bytes, processes=comm.size)
+    memory = estimate(config, dataset, start, processes=comm.size)
     usable = round(USABLE_SHARE * (available_memory() / comm.num_on_machine + resident_memory()))
-    if memory.required_bytes > usable:
-        raise UserError(_refusal(config, dataset, gaussians, memory, usable, comm.size))
+
+    def check() -> None:
+        if memory.required_bytes > usable:
+            raise UserError(_refusal(config, dataset, start, memory, usable, comm.size))
+
+    comm.collective(check)
     left = usable - round(1.15 * memory.required_bytes)  # an estimate may be wrong
-    return max(0, min(memory.targets, left))
+    return max(0, left)
 
 
 def _refusal(
     config: FitConfig,
     dataset: Dataset,
-    gaussians: Gaussians,
+    start: int,
     memory: FitMemory,
     usable: int,
     processes: int,
 ) -> str:
-    train, start = dataset.train, gaussians.num_gaussians
+    train = dataset.train
     count, width = max_num_gaussians(config, start), max(view.width for view in train)
 
     def fits(most: int, scale: float = 1.0) -> bool:
         densify = config.densify.model_copy(update={"max_gaussians": most})
         smaller = config.model_copy(update={"densify": densify})
-        needed = estimate(smaller, dataset, gaussians, 0, scale, processes).required_bytes
-        return needed <= 0.95 * usable
+        return estimate(smaller, dataset, start, scale, processes).required_bytes <= 0.95 * usable
 
     most = next(filter(fits, _smaller(count, start)), None)
     size = next((s for s in _smaller(width, MIN_WIDTH_PX) if fits(count, s / width)), None)
@@ -217,7 +153,7 @@ def _refusal(
         f"memory: {who} needs about {format_bytes(memory.required_bytes)} "
         f"({format_bytes(memory.photographs)} for {len({*train, *dataset.test}):,} photographs, "
         f"{format_bytes(memory.gaussians)} for {part}{count:,} Gaussians, "
-        f"{format_bytes(memory.splats + memory.pixels)} for an image of them), and may take "
+        f"{format_bytes(memory.image)} for an image of them), and may take "
         f"{format_bytes(usable)}, nine tenths of the available memory; {advice}"
     )
 

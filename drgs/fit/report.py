@@ -7,12 +7,11 @@ import html
 import io
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib import resources
-from itertools import pairwise
 from pathlib import Path
 from string import Template
 from typing import NamedTuple
@@ -59,7 +58,7 @@ PANEL_WIDTH_PX = 360  # maximum width of an image in the page's comparisons
 PANEL_ENCODING = {"lossless": True, "quality": 60, "method": 2}
 """Lossy coding leaves a haze around objects before a white background."""
 
-MIN_TRIAL_SECONDS = 0.2  # for averaging renders of a few milliseconds
+MIN_TRIAL_SECONDS = 0.05  # for averaging calls of a few milliseconds
 FILES_SECONDS = 0.3  # time of the other files, measured with 50,000 Gaussians
 
 
@@ -137,15 +136,21 @@ class Seconds(NamedTuple):
 def seconds_of_results(
     scene: mi.Scene, dataset: Dataset, num_gaussians: int, sh_degree: int
 ) -> Seconds:
-    """Estimate the time of the results without curves by timing one test view.
+    """Estimate the time of the results by timing one test view, and two curves.
 
     num_gaussians, sh_degree: of the final Gaussians.
     """
-    _seconds_of_view(scene, dataset.test[0])  # loads kernels and libraries
-    tried = [_seconds_of_view(scene, dataset.test[0])]
-    while sum(map(sum, tried)) < MIN_TRIAL_SECONDS:
-        tried.append(_seconds_of_view(scene, dataset.test[0]))
-    rendered, scored, written, compared, encoded = np.median(tried, axis=0).tolist()
+    view, x = dataset.test[0], np.linspace(1.0, 100.0, 1000)
+    (image,) = render_views(scene, (view,))
+    rendered = _seconds_of(lambda: list(render_views(scene, (view,))))
+    scored = _seconds_of(lambda: score(image, view))
+    written = _seconds_of(lambda: encode(image, "png"))
+    compared = _seconds_of(lambda: encode(side_by_side(image, view), "png"))
+    encoded = _seconds_of(lambda: encode(image, "webp", **PANEL_ENCODING))
+    log, linear = (
+        _seconds_of(lambda: draw_curve(Panel("", x, x, scale=scale, noisy=True)))  # noqa: B023
+        for scale in ("log", "linear")
+    )
     views, pictures = len(dataset.test), min(MAX_PICTURES, len(dataset.test))
     return Seconds(
         measuring=FILES_SECONDS + views * (rendered + scored),
@@ -155,40 +160,20 @@ def seconds_of_results(
         + pictures * compared
         + len(choose_views(range(views))) * (rendered + 3 * encoded)
         + len(dataset.train) * rendered  # to be ranked
-        + ORBIT_FRAMES * (2 * rendered + encoded),
+        + ORBIT_FRAMES * (2 * rendered + encoded)
+        + 2 * NUM_PANELS * (log + 2 * linear) / 3,  # a third of the curves are logarithmic
     )
 
 
-def _seconds_of_view(scene: mi.Scene, view: View) -> tuple[float, ...]:
-    """Time rendering, scoring, writing, comparing, and encoding for an orbit."""
-    start = time.perf_counter()
-    (image,) = render_views(scene, (view,))
-    clock = [start, time.perf_counter()]
-    for step in (
-        lambda: score(image, view),
-        lambda: encode(image, "png"),
-        lambda: encode(side_by_side(image, view), "png"),
-        lambda: encode(image, "webp", **PANEL_ENCODING),
-    ):
-        step()
-        clock.append(time.perf_counter())
-    return tuple(later - earlier for earlier, later in pairwise(clock))
-
-
-def seconds_of_curves() -> float:
-    """Estimate the time of all curves, in the page and in ``curves.png``, by timing two."""
-    x = np.linspace(1.0, 100.0, 1000)
-    log, linear = (Panel("", x, x, scale=scale, noisy=True) for scale in ("log", "linear"))
-    _seconds_of_curve(log)  # loads libraries and fonts
-    # A third of the curves are logarithmic, with slower labels.
-    mean = (_seconds_of_curve(log) + 2 * _seconds_of_curve(linear)) / 3
-    return NUM_PANELS * mean * 2
-
-
-def _seconds_of_curve(panel: Panel) -> float:
-    start = time.perf_counter()
-    draw_curve(panel)
-    return time.perf_counter() - start
+def _seconds_of(call: Callable[[], object]) -> float:
+    """Return the median time of a call, without the first, which loads kernels and libraries."""
+    call()
+    times: list[float] = []
+    while sum(times) < MIN_TRIAL_SECONDS:
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
 
 
 def side_by_side(image: np.ndarray, view: View) -> np.ndarray:

@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,8 +19,9 @@ from typing_extensions import override
 
 from drgs.cli.ending import StopRequest
 from drgs.cli.execution import select_variant
-from drgs.cli.progress import RunProgress
+from drgs.cli.progress import RunProgress, StepProgress
 from drgs.config.changes import with_changes
+from drgs.config.extensions import EXAMINERS
 from drgs.config.load import config_from, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
@@ -30,21 +30,21 @@ from drgs.core.memory import release_unused_memory
 from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.folders import config_for
-from drgs.examine.examination import Examination, examine, show_progress
-from drgs.fit.budget import Budget, Deadline, Plan, plan_fit, rehearse
+from drgs.effects.base import ChosenEffects, Examiner, TrainingEffect
+from drgs.fit.budget import Budget, Plan, deadline, plan_fit, rehearse
 from drgs.fit.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.fit.fingerprint import Fingerprint, fingerprint_of
 from drgs.fit.fit_folder import FitFolder, saved_gaussians
 from drgs.fit.inputs import share_gaussians, share_inputs
 from drgs.fit.loop import (
+    Continues,
     HeldOutQuality,
     History,
     Iteration,
     Observer,
-    RootDecides,
-    StopCriterion,
     iterations,
     smoother,
+    until_planned_end,
 )
 from drgs.fit.memory import room_for_targets
 from drgs.fit.summary import summary_of_fit
@@ -55,7 +55,6 @@ from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import format_effects
 from drgs.results.history import HistoryRow
 from drgs.training.density.strategy import DensityStrategy
-from drgs.training.effects.base import TrainingEffect
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.losses import Loss
 from drgs.training.parallel.communicator import Communicator
@@ -68,8 +67,8 @@ if TYPE_CHECKING:  # imported where it is needed
 class ProgressLine(Observer):
     """Draws the progress of a fit: see :class:`drgs.fit.loop.Observer`."""
 
-    def __init__(self, progress: RunProgress, criterion: StopCriterion) -> None:
-        self._progress, self._criterion = progress, criterion
+    def __init__(self, progress: RunProgress) -> None:
+        self._progress = progress
         self._psnr: float | None = None  # dB, smooth
 
     @override
@@ -80,7 +79,8 @@ class ProgressLine(Observer):
             self._psnr = smoother(self._psnr, row.psnr)
             status = f"loss {row.loss:.4f}  PSNR {self._psnr:5.2f} dB  "
             status += f"Gaussians {row.num_gaussians:,}"
-            self._progress.update(row.iteration, self._criterion.num_iterations(trainer), status)
+            total = row.iteration if done.is_last else trainer.config.last_iteration
+            self._progress.update(row.iteration, max(row.iteration, total), status)
 
 
 @dataclass(eq=False)
@@ -103,10 +103,10 @@ class FitSession:
     effects: Sequence[TrainingEffect] = ()  # besides the configured ones
     loss: Loss | None = None  # None: the configured one
     examines: bool = False  # whether an examination of the dataset chooses effects
-    examination: Examination | None = field(init=False, default=None)
+    examination: ChosenEffects | None = field(init=False, default=None)
     trainer: Trainer = field(init=False)
     history: History = field(init=False)
-    criterion: StopCriterion = field(init=False, default_factory=StopCriterion)
+    continues: Continues = field(init=False, default_factory=lambda: until_planned_end)
     observers: list[Observer] = field(init=False, default_factory=list)
     _fingerprint: Fingerprint | None = field(init=False, default=None)
 
@@ -135,7 +135,7 @@ class FitSession:
                 if self.examination is not None:
                     folder.write_examination(self.examination)
             if plan is not None:
-                self.criterion = Deadline(self.trainer, plan.end, plan.chosen.curve)
+                self.continues = deadline(plan.end, self.comm)
                 if folder is not None and self.budget is not None:
                     folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
             self.on_start(self)
@@ -176,7 +176,7 @@ class FitSession:
         if self.budget is not None:
             plan = self._plan(gaussians, self.budget)
         self.config, self.dataset = share_inputs(comm, self.config, self.dataset)
-        room = partial(room_for_targets, self.config, self.dataset, gaussians, comm)
+        room = room_for_targets(self.config, self.dataset, gaussians.num_gaussians, comm)
         self.trainer = Trainer(
             self.config, self.dataset, gaussians, comm, *self._objects, room=room
         )
@@ -194,7 +194,7 @@ class FitSession:
         if checkpoint is not None and checkpoint.config is not None:
             config = checkpoint.config
         if self.dataset is None:
-            self.dataset = load_dataset(config.data_for_training, sections=config.extensions)
+            self.dataset = load_dataset(config.data_for_training, sections=config.sections)
         if folder is not None:
             self._fingerprint = fingerprint_of(self.dataset)
             if checkpoint is not None:
@@ -206,20 +206,24 @@ class FitSession:
     def _examine(self, given: FitConfig) -> None:
         """Choose the effects that the photographs call for; given: not completed."""
         _, dataset = self._inputs
-        with show_progress() if self.uses_terminal else nullcontext() as progress:
-            self.examination = examine(dataset, given, progress)
+        if not (names := EXAMINERS.names()):
+            self._print("not examined: no examiner is installed")
+            return
+        examine: Examiner = EXAMINERS.get(names[0]).value
+        with StepProgress("examining: ") if self.uses_terminal else nullcontext() as steps:
+            self.examination = examine(dataset, given, None if steps is None else steps.update)
         self._print(str(self.examination))
         changes = self.examination.changes
         if changes:
             given = with_changes(given, changes)
         if "data.background" in changes:
-            self.dataset = load_dataset(given.data_for_training, sections=given.extensions)
+            self.dataset = load_dataset(given.data_for_training, sections=given.sections)
         self.config = resolve_defaults(given, self._inputs[1])
 
     def _plan(self, gaussians: Gaussians, budget: Budget) -> Plan | None:
         """Plan the fit, and make the plan its configuration; None on other ranks than 0."""
         start = self.config, self.dataset, gaussians, self.comm
-        trainer, iteration_s = rehearse(*start, *self._objects)
+        trainer, iteration_s = rehearse(*start, *self._objects, seconds=budget.rehearsal_s)
         scene = trainer.full_scene()  # gathered from all ranks
         if scene is None:
             return None
@@ -263,16 +267,15 @@ class FitSession:
 
         The state is saved then, and after the last iteration, before results are written.
         """
-        trainer, comm = self.trainer, self.comm
-        criterion, stop = RootDecides(self.criterion, comm), StopRequest()
+        trainer, comm, stop = self.trainer, self.comm, StopRequest()
         with ExitStack() as blocks:
             observers: list[Observer] = [HeldOutQuality(trainer.dataset.test), *self.observers]
             if self.uses_terminal:
-                total = criterion.num_iterations(trainer)
+                total = trainer.config.last_iteration
                 progress = RunProgress("iteration", total, trainer.iteration)
-                observers.insert(0, ProgressLine(blocks.enter_context(progress), criterion))
+                observers.insert(0, ProgressLine(blocks.enter_context(progress)))
                 blocks.enter_context(stop)
-            for done in iterations(trainer, self.history, criterion):
+            for done in iterations(trainer, self.history, self.continues):
                 self.check_ranges()
                 for observer in observers:
                     observer.after_iteration(trainer, self.history, done, lambda: stop.requested)
@@ -371,7 +374,7 @@ def train(
     with reporting_extensions():
         session.prepare()
         trainer, history = session.trainer, session.history
-        for done in iterations(trainer, history, session.criterion):
+        for done in iterations(trainer, history, session.continues):
             if callback is not None and callback(done.report):
                 break
     gaussians = saved_gaussians(trainer.gaussians(), trainer.config)

@@ -23,12 +23,12 @@ from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import View
+from drgs.effects.base import TrainingEffect
+from drgs.effects.colors import ColorConfig
 from drgs.effects.smoothing import bake_for_viewers, bake_smoothing
 from drgs.fit.inputs import share_gaussians
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.training.effects.base import TrainingEffect
 from drgs.training.rates import TOUCH_UP_RATES
 from drgs.training.trainer import Trainer
 
@@ -56,7 +56,7 @@ class ForViewers:
 
 def num_iterations(config: FitConfig) -> int:
     """Return the number of extra iterations."""
-    return math.ceil(ITERATIONS_SHARE * config.iterations)
+    return math.ceil(ITERATIONS_SHARE * config.last_iteration)
 
 
 def for_viewers(
@@ -80,7 +80,7 @@ def for_viewers(
         while tuner.iteration < further.iterations:
             if tuner.step().passes(further.output.history_every):
                 tuner.check_iterations()
-            watch(tuner.iteration - trainer.config.iterations)
+            watch(tuner.iteration - trainer.iteration)
         tuned = tuner.gaussians()
     except UserError as error:  # numbers that are not finite, or too little memory by now
         note = f"the Gaussians for viewers are not fitted any further: {error}"
@@ -93,18 +93,15 @@ def for_viewers(
 
 def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
     """Return Gaussians in closed form, by the training cameras as the fit has them."""
-    states = (
-        read_sensor(sensor, trainer.integrator.near) for sensor in trainer.fit_state().sensors()
-    )
     on_device = bake_smoothing(gaussians).to(mi.TensorXf)
     with dr.suspend_grad():
-        cameras = map(camera_from_sensor, states)
+        cameras = trainer.fit_state().cameras()
         return bake_for_viewers(on_device, cameras, trainer.config.model.approximations)
 
 
 def tuning(config: FitConfig) -> FitConfig:
     """Return the configuration of the extra iterations after a fit with ``config``."""
-    before = config.iterations
+    before = config.last_iteration
     total = before + num_iterations(config)
     kept = {"max_gaussians": config.densify.max_gaussians}
     views_per_step = config.optimizer.views_per_step  # which processes may share
@@ -112,6 +109,7 @@ def tuning(config: FitConfig) -> FitConfig:
         **{f"model.{name}": _configured_default(name) for name in DECLARED},
         "model.smoothing": False,
         "iterations": total,
+        "stop_after": None,
         "coarse": [],
         "densify": {"strategy": "adc", "start": 0, "stop": 1, **kept},  # never changes
         "optimizer": {
@@ -122,7 +120,7 @@ def tuning(config: FitConfig) -> FitConfig:
         **{f"cameras.{name}_lr": 0.0 for name in ("rotation", "translation", "focal", "principal")},
     }
     for name in ("lr", "vignetting_lr", "response_lr"):
-        if getattr(config.colors, name) is not None:
+        if getattr(config.section("colors", ColorConfig), name) is not None:
             changes[f"colors.{name}"] = NEGLIGIBLE_RATE
     return with_changes(config, changes)
 

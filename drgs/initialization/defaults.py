@@ -8,6 +8,7 @@ import numpy as np
 
 from drgs.cameras.viewpoints import focus_of
 from drgs.config.changes import with_changes
+from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.types import Dataset
@@ -78,8 +79,8 @@ def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, obje
     """Return the numbers at the start and in the end that are not given."""
     changes: dict[str, object] = {}
     densify, at_start = config.densify, REFERENCE_POINTS
-    if densify.strategy in ("budget", "mcmc"):
-        goal = getattr(densify, densify.strategy).gaussians
+    if densify.has_goal:
+        goal = getattr(densify.settings, "gaussians", None)
         if goal is None:
             sides = [math.sqrt(view.width * view.height) for view in dataset.train]
             suitable = round(GAUSSIANS_PER_PIXEL_OF_SIDE * float(np.mean(sides or [1])))
@@ -96,7 +97,8 @@ def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
     until = round(COARSE_SHARE * config.iterations)
     sides = [min(view.width, view.height) for view in dataset.train]
     is_small = min(sides, default=0) < MIN_COARSE_SIDE_PX
-    if config.densify.strategy == "adc" or until < 1 or is_small:
+    begins_coarse = STRATEGIES.get(config.densify.strategy).value.begins_coarse
+    if not begins_coarse or until < 1 or is_small:
         return []
     return [{"until": until, "factor": 2}]
 

@@ -60,7 +60,7 @@ def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
 def gaussians_at(start: Start, config: FitConfig) -> Gaussians:
     """Return isotropic Gaussians at 4 points or more, numpy float32, as large as the gaps between.
 
-    The standard deviation is ``init.scale`` times the root mean square distance to the 3 nearest
+    The standard deviation is the root mean square distance to the 3 nearest
     other points, which is that of the 3DGS reference (``distCUDA2``). The opacity is
     ``init.opacity``, the degree ``model.sh_degree``. Without colours: grey. Identity rotations; SH
     coefficients above degree 0 are zero.
@@ -70,7 +70,7 @@ def gaussians_at(start: Start, config: FitConfig) -> Gaussians:
     colors = np.full((num, 3), 0.5) if start.colors is None else start.colors
     spacing = np.sqrt(mean_squared_neighbour_distance(means))
     spacing = np.maximum(spacing, MIN_SPACING * _median_radius(means))
-    log_scales = np.repeat(np.log(init.scale * spacing)[:, None], 3, axis=1)
+    log_scales = np.repeat(np.log(spacing)[:, None], 3, axis=1)
     logit = np.log(init.opacity / (1 - init.opacity))
     sh0 = (np.asarray(colors, np.float64) - 0.5) / SH_C0
     return Gaussians(

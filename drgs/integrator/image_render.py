@@ -36,9 +36,11 @@ from drgs.integrator.sensors import (
     read_sensor,
     sensors_of,
 )
-from drgs.integrator.state import Cached, SplatsState, surfaces_in
+from drgs.integrator.state import Cached, ProjectedView, SplatsState, surfaces_in
 from drgs.splatting import rendering
 from drgs.splatting.footprint import SamplePositions
+from drgs.splatting.rasterize import SplatGradients
+from drgs.splatting.tiles import SplatTable
 
 if TYPE_CHECKING:  # imported where a scene requires them
     from drgs.integrator.light.surfaces import NestedSurfaces
@@ -136,6 +138,12 @@ class ImageRender:
             self.nested.backward(params, d_nested)
         return reduce(rendering.sum_of_gradients, gradients)
 
+    def splats_backward(self, projected: ProjectedView, grad_in: mi.TensorXf) -> None:
+        """Leave derivatives with respect to splats that were projected beforehand in these."""
+        (view,) = self.views
+        projected.gradients = view.splats_backward(self.samples.adjoint(grad_in))
+        projected.frames = [frame for frame, *_ in view.frames]
+
     def tangent(self, params: object, tangents: Gaussians) -> mi.TensorXf:
         """Return the directional derivative; tangents: of the Gaussians."""
         splats = self.views[0].splats
@@ -229,11 +237,11 @@ class SensorRender:
 
     def planes(self) -> Planes:
         """Return the planes of all frames, unevaluated."""
-        return [[frame.planes() for frame in of_time] for of_time in self._frames]
+        return [[frame.planes() for frame in of_time] for of_time in self.frames]
 
     def plane_tangents(self, tangents: Gaussians) -> Planes:
         """Return tangents of planes along those of the Gaussians and of the sensor."""
-        frames = self._frames
+        frames = self.frames
         with dr.resume_grad():
             d_cameras = self._camera_tangents(len(frames))
         return [
@@ -243,6 +251,30 @@ class SensorRender:
 
     def backward(self, d_channels: Passes) -> rendering.GaussianGradients:
         """Return derivatives with respect to the Gaussians; accumulate all others."""
+        d_planes = self._planes_backward(d_channels)
+        with dr.resume_grad():
+            state = self._state()
+            is_attached = state.is_attached
+        by_time = [
+            rendering.frames_adjoint(self.splats.gaussians, *of_time, is_attached)
+            for of_time in zip(self.frames, d_planes, strict=True)
+        ]
+        of_cameras = [gradients.camera for gradients in by_time if gradients.camera]
+        if of_cameras:
+            with dr.resume_grad():
+                accumulate_in_sensor(self._attached_cameras(state), of_cameras)
+        return reduce(rendering.sum_of_gradients, by_time)
+
+    def splats_backward(self, d_channels: Passes) -> list[SplatGradients]:
+        """Return derivatives with respect to the 2D splats, by time; add the background's."""
+        d_planes = self._planes_backward(d_channels)
+        return [
+            rendering.splats_adjoint(*of_time)
+            for of_time in zip(self.frames, d_planes, strict=True)
+        ]
+
+    def _planes_backward(self, d_channels: Passes) -> Planes:
+        """Return derivatives with respect to the planes; accumulate the background's."""
         planes, constant = self.planes(), constant_background(self.splats)
         with dr.resume_grad():
             of_background = constant is not None and dr.grad_enabled(self.splats.background)
@@ -260,20 +292,10 @@ class SensorRender:
         d_passes = list(chain(*d_planes))
         for first in range(0, len(d_passes), PASSES_PER_KERNEL):
             dr.eval(d_passes[first : first + PASSES_PER_KERNEL], d_constant)
-        with dr.resume_grad():
-            state = self._state()
-            is_attached = state.is_attached
-        by_time = [
-            rendering.frames_adjoint(self.splats.gaussians, *of_time, is_attached)
-            for of_time in zip(self._frames, d_planes, strict=True)
-        ]
-        with dr.resume_grad():
-            if of_background:
+        if of_background:
+            with dr.resume_grad():
                 dr.accum_grad(self.splats.background, d_constant)
-            of_cameras = [gradients.camera for gradients in by_time if gradients.camera]
-            if of_cameras:
-                accumulate_in_sensor(self._attached_cameras(state), of_cameras)
-        return reduce(rendering.sum_of_gradients, by_time)
+        return d_planes
 
     def channels(self, planes: Planes, constant: mi.Color3f | None) -> Passes:
         """Return the mean over times of each pass's channels; constant: the background."""
@@ -361,7 +383,7 @@ class SensorRender:
         behind = splats.background if environment is None else environment
         assert isinstance(behind, (mi.Emitter, mi.Texture)), "a colour would be constant"
         state = self._state()
-        cameras = [of_time[0].camera for of_time in self._frames]
+        cameras = [of_time[0].camera for of_time in self.frames]
         if state.is_attached:
             cameras = self._attached_cameras(state)
         from drgs.integrator.background import background_radiance
@@ -372,7 +394,7 @@ class SensorRender:
         return _Background(colors, environment is not None, radiance)
 
     @cached_property
-    def _frames(self) -> list[list[rendering.Frame]]:
+    def frames(self) -> list[list[rendering.Frame]]:
         """Frames by time and by pass, from the cache where nothing has changed."""
         pipeline, gaussians = self.splats.pipeline, dr.detach(self.splats.gaussians)
         state = self._camera_state
@@ -381,9 +403,12 @@ class SensorRender:
 
         def render_all() -> list[list[rendering.Frame]]:
             surfaces = repeat(None) if traced is None else traced.value
+            projected = self.splats.projected_view
+            splats = repeat(None) if projected is None else projected.splats
+            by_time = zip(self._cameras(state), surfaces, splats, strict=False)
             return [
-                self._render_time(gaussians, camera, pipeline, in_passes)
-                for camera, in_passes in zip(self._cameras(state), surfaces, strict=False)
+                self._render_time(gaussians, camera, pipeline, in_passes, of_time)
+                for camera, in_passes, of_time in by_time
             ]
 
         return self.splats.cache.find(f"frames {self.index}", *key, render_all).value
@@ -394,8 +419,12 @@ class SensorRender:
         camera: Camera,
         pipeline: rendering.Pipeline,
         surfaces: Sequence[SurfaceLayers] | None,
+        splats: SplatTable | None,
     ) -> list[rendering.Frame]:
-        """Render a frame for each pass; surfaces: the visible ones, by pass."""
+        """Render a frame for each pass.
+
+        surfaces: the visible ones, by pass; splats: of the Gaussians, if projected beforehand.
+        """
         pipeline = with_effects(pipeline, gaussians, camera)
         models = [replace(pipeline.model, positions=points) for points in self.positions]
         if surfaces is not None:
@@ -405,7 +434,11 @@ class SensorRender:
             models = [occlude(model, layers, camera) for model, layers in pairs]
             pipeline = replace(pipeline, features=(*pipeline.features, rendering.depth_feature))
         first, *others = models
-        frame = rendering.render(gaussians, camera, replace(pipeline, model=first))
+        pipeline = replace(pipeline, model=first)
+        if splats is None:
+            frame = rendering.render(gaussians, camera, pipeline)
+        else:
+            frame = rendering.render_splats(splats, camera, pipeline)
         return [frame, *(rendering.render_again(frame, model) for model in others)]
 
     def _traced_surfaces(self, nested: NestedSurfaces) -> Cached[list[list[SurfaceLayers]]]:

@@ -23,6 +23,8 @@ from drgs.core.private import same_variables
 from drgs.core.types import Bool, Float, TensorXf, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting import rendering
+from drgs.splatting.rasterize import SplatGradients
+from drgs.splatting.tiles import SplatTable
 
 if TYPE_CHECKING:
     from drgs.integrator.parts import CombinedParts, Part, Placement, ShRotation
@@ -52,6 +54,18 @@ class BackwardResult:
         """
         sums = [rendering.weighted_sums(frame, plane)[0] for frame in self.frames]
         return sum(sums[1:], sums[0]) / sum(frame.tiles.bins.grid.samples for frame in self.frames)
+
+
+@dataclass(eq=False)
+class ProjectedView:
+    """The splats of one view, projected beforehand; lists are by time of the shutter.
+
+    They come with what a backward pass returns for them: the parameters get no derivatives.
+    """
+
+    splats: Sequence[SplatTable]
+    gradients: Sequence[SplatGradients] = ()
+    frames: Sequence[rendering.Frame] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +162,7 @@ class SplatsState:
     given_error: float | None  # budget of the approximations' error; None: as they are given
     budget_report: Any = None  # drgs.accuracy.error_budget.BudgetReport, once it was met
     cache: RenderCache = field(default_factory=RenderCache)
-    projection: rendering.ProjectionStage = field(default_factory=rendering.DirectProjection)
+    projected_view: ProjectedView | None = None  # rendered instead of the Gaussians
 
     @property
     def objects(self) -> dict[str, SplatObject]:
@@ -201,12 +215,12 @@ class SplatsState:
         # A smoothing filter is differentiated where it scales with an object.
         of_smoothing = parts is not None and parts.gaussians.smoothing is not None
         kinds = tuple(self.aovs.values())
-        settings = self.approximations, self.sh_degree, of_smoothing, kinds, self.projection
+        settings = self.approximations, self.sh_degree, of_smoothing, kinds
 
         def make() -> rendering.Pipeline:
             others = [feature_of(kind) for kind in kinds if kind != "alpha"]
             pipeline = pipeline_of(*settings[:2], (rendering.color_features, *others))
-            return replace(pipeline, of_smoothing=of_smoothing, source=self.projection)
+            return replace(pipeline, of_smoothing=of_smoothing)
 
         return self.cache.find("pipeline", settings, (), make).value
 

@@ -7,34 +7,18 @@ Commands print one at their start, a line an effect: :func:`summary_of_sensors` 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Lens, Pinhole
 from drgs.cameras.viewpoints import Viewpoint
+from drgs.effects.base import SimulatedEffect, antialiasing_effect
 from drgs.effects.compose import without_effects
 from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
 from drgs.integrator.state import SplatsState, surfaces_in
 
 FILE_HEADER_REASON = "set by the file"  # for effects that the header of the Gaussians' file sets
-
-
-@dataclass(frozen=True)
-class SimulatedEffect:
-    """An effect in a summary, simulated or not."""
-
-    name: str
-    what: str | None  # description; None: not simulated
-    why: str = ""  # the setting or data that it comes from
-    ignored: bool = False  # whether a setting switches it off
-
-    def unless_ignored(self, is_ignored: bool) -> SimulatedEffect:
-        """Return the effect, not simulated if it ``is_ignored``."""
-        if is_ignored and self.what is not None:
-            return replace(self, what=None, ignored=True)
-        return self
 
 
 def format_effects(effects: Sequence[SimulatedEffect]) -> str:
@@ -146,15 +130,6 @@ def _lens_words(lens: Lens) -> str | None:
     return type(lens).__name__ + (f" ({names})" if names else "")
 
 
-def antialiasing_effect(opacities: str | None, smoothing: str | None) -> SimulatedEffect:
-    """Summarise it from the reasons for compensated opacities and for the smoothing filter."""
-    what = join_parts(
-        "opacities compensated for the low-pass filter" if opacities else None,
-        "3D smoothing filter" if smoothing else None,
-    )
-    return SimulatedEffect("antialiasing", what, join_parts(opacities, smoothing) or "")
-
-
 def view_dependence_effect(degree: int, why: str) -> SimulatedEffect:
     """Summarise view-dependent colours; degree: of the spherical harmonics."""
     what = None if degree == 0 else f"spherical harmonics up to degree {degree}"
@@ -173,8 +148,3 @@ def motion_effect(views: Sequence[Viewpoint], of: str = "the dataset's cameras")
     moving = [view.motion.shutter for view in views if view.motion is not None]
     shutters = " and ".join(f"{kind} shutter" for kind in sorted(set(moving)))
     return SimulatedEffect("motion", shutters or None, f"{len(moving)} of {of}")
-
-
-def join_parts(*parts: str | None) -> str | None:
-    """Join the parts that are not None by commas; None if there is none."""
-    return ", ".join(part for part in parts if part) or None

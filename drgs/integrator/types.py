@@ -9,8 +9,8 @@ import mitsuba as mi
 
 from drgs.core.types import Float
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.state import BackwardResult, SplatsState
-from drgs.splatting.rendering import Pipeline, ProjectionStage
+from drgs.integrator.state import BackwardResult, ProjectedView, SplatsState
+from drgs.splatting.rendering import Pipeline
 
 if TYPE_CHECKING:
 
@@ -25,10 +25,7 @@ if TYPE_CHECKING:
         ignore: Sequence[str]
         pipeline: Pipeline
         last: BackwardResult  # after a backward pass
-
-        def use_projection(self, stage: ProjectionStage) -> None:
-            """Set the projection of the coming renders."""
-            ...
+        projected_view: ProjectedView | None
 
         def forget_frames(self) -> None:
             """Clear the cached frames."""

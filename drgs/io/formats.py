@@ -103,31 +103,17 @@ class FileFormat:
         return cls.metadata is None or name in cls.metadata
 
 
-FORMATS: Registry[type[FileFormat]] = Registry(
-    "file format",
-    {
-        "ply": "drgs.io.ply",
-        "compressed-ply": "drgs.io.compressed_ply",
-        "spz": "drgs.io.spz",
-        "sog": "drgs.io.sog",
-        "glb": "drgs.io.glb",
-        "splat": "drgs.io.splat",
-        "ksplat": "drgs.io.ksplat",
-        "usd": "drgs.io.usd",
-    },
-)
+FORMATS: Registry[type[FileFormat]] = Registry("file format", "drgs.formats")
 
 
 def readable_formats() -> list[Extension[type[FileFormat]]]:
     """Return the formats whose files can be read."""
-    formats = map(FORMATS.get, FORMATS.names())
-    return [each for each in formats if each.value.read is not FileFormat.read]
+    return [each for each in FORMATS.all() if each.value.read is not FileFormat.read]
 
 
 def writable_formats() -> list[Extension[type[FileFormat]]]:
     """Return the formats whose files can be written."""
-    formats = map(FORMATS.get, FORMATS.names())
-    return [each for each in formats if each.value.encode is not FileFormat.encode]
+    return [each for each in FORMATS.all() if each.value.encode is not FileFormat.encode]
 
 
 def _shipped_formats() -> list[Extension[type[FileFormat]]]:

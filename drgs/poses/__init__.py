@@ -1,4 +1,6 @@
-"""``drgs poses``: camera poses of photographs by COLMAP's structure from motion.
+"""Find out where photographs were taken.
+
+By COLMAP's structure from motion.
 
 May import the packages that commands may import.
 """

@@ -1,4 +1,4 @@
-"""``drgs render``: images of Gaussians, of a fit, of a Mitsuba scene.
+"""Render Gaussians, a fit, or a Mitsuba scene.
 
 May import everything but other commands.
 """

@@ -22,8 +22,9 @@ from drgs.config.schema import FitConfig
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.files import atomic_path
 from drgs.datasets.camera_file import read_viewpoints
+from drgs.effects.cameras import CAMERAS, CamerasConfig
 from drgs.io.images import check_animation, write_animation
-from drgs.results.files import CAMERAS, METRICS, ORBIT
+from drgs.results.files import METRICS, ORBIT
 from drgs.results.metrics import Quality, mean_of, psnr, ssim
 from drgs.results.model import ImageFolder, Model
 from drgs.results.model_arguments import UP
@@ -100,7 +101,7 @@ def _orbited_views(
     """Return the training cameras: those in a fit's folder, unless photographs are named."""
     if args.what.is_dir() and (args.scene, args.data, args.set) == (None, None, None):
         refined = args.what / CAMERAS
-        if config.cameras.optimise and refined.is_file():
+        if config.section("cameras", CamerasConfig).optimise and refined.is_file():
             print(f"cameras: as refined, from {refined}")
         if (views := training_cameras(args.what, model.gaussians.origin)) is not None:
             return views

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from drgs.config.extensions import EFFECTS
+
 CONFIG = "config.yml"  # every value of the configuration; marks whose folder it is
 CHECKPOINT = "checkpoint.npz"  # while the fit runs: see :mod:`drgs.fit.checkpoint`
 GAUSSIANS = "point_cloud.ply"
@@ -15,10 +17,7 @@ REPORT = "report.html"
 VIEWER = "viewer.html"  # interactive page of the Gaussians, unless too large
 RENDERS = "renders"  # a folder for each split, with an image of each view
 SIDE_BY_SIDE = "side_by_side"  # the same, with the photograph and the difference beside the image
-CAMERAS = "cameras.json"  # refined cameras of the training views
 VIEWS = "views.json"  # the dataset's cameras of the training views, for orbits
-COLORS = "colors.json"  # colour transforms of the training views
-PHOTOMETRY = "photometry.json"  # vignetting and response of the training views' cameras
 EXAMINATION = "examination.json"  # which effects an examination chose, with the evidence
 BUDGET_PLAN = "plan.txt"  # the plan for a budget of time, with reasons
 TENSORBOARD = "tensorboard"  # a folder, with ``--tensorboard``
@@ -26,19 +25,10 @@ EVENTS = f"{TENSORBOARD}/events.out.tfevents.fit"  # TensorBoard finds the word 
 METRICS = "metrics.json"  # written last
 ERROR_BUDGET = "error_budget.json"  # of ``drgs render --error``
 
-RESULTS = (
-    *(CAMERAS, CHECKPOINT, COLORS, CURVES, DENSITY, EXAMINATION, HISTORY, METRICS, ORBIT),
-    PHOTOMETRY,
-    *(
-        ORBIT_GIF,
-        BUDGET_PLAN,
-        GAUSSIANS,
-        GAUSSIANS_FOR_VIEWERS,
-        RENDERS,
-        REPORT,
-        SIDE_BY_SIDE,
-        TENSORBOARD,
-    ),
-    *(VIEWER, VIEWS),
-)
-"""Files of a fit but for ``config.yml``."""
+
+def result_names() -> list[str]:
+    """Return the files of a fit but for ``config.yml``, with those of effects."""
+    names = [name for effect in EFFECTS.all() for name in effect.value.files]
+    names += [CHECKPOINT, CURVES, DENSITY, EXAMINATION, HISTORY, METRICS, ORBIT, ORBIT_GIF]
+    names += [BUDGET_PLAN, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, RENDERS, REPORT, SIDE_BY_SIDE]
+    return [*names, TENSORBOARD, VIEWER, VIEWS]

@@ -27,9 +27,9 @@ from drgs.results.files import (
     EXAMINATION,
     METRICS,
     RENDERS,
-    RESULTS,
     SIDE_BY_SIDE,
     TENSORBOARD,
+    result_names,
 )
 
 COMMAND = "fit"
@@ -215,7 +215,9 @@ def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
     record, files = FolderRecord(folder, COMMAND), list(_files(folder))
     if names:
         load_run_config(folder)
-        _check_removable(folder, record, sorted(set(names) - {CONFIG, *RESULTS}), files, images)
+        _check_removable(
+            folder, record, sorted(set(names) - {CONFIG, *result_names()}), files, images
+        )
     elif not os.path.lexists(folder):
         return
     remove_stale_temporaries(folder)
@@ -257,7 +259,7 @@ def _check_removable(
 
 def _files(folder: Path) -> Iterator[str]:
     """Yield the names of the results that are there, and of everything in FOLDERS."""
-    for name in RESULTS:
+    for name in result_names():
         path = folder / name
         if name not in FOLDERS or path.is_symlink() or not path.is_dir():
             if os.path.lexists(path):
@@ -271,7 +273,7 @@ def _files(folder: Path) -> Iterator[str]:
 
 def _file_names(images: Sequence[str]) -> list[str]:
     """Return the files that a fit writes, except ``config.yml``, whose content is checked."""
-    return [*(name for name in RESULTS if name not in FOLDERS), EVENTS, *images]
+    return [*(name for name in result_names() if name not in FOLDERS), EVENTS, *images]
 
 
 def _visible_names(folder: Path) -> list[str]:
@@ -319,19 +321,26 @@ def _differences_of_run(folder: Path, config: FitConfig) -> str:
             run = relocate_data(folder, load_run_config(folder))
     except UserError:
         return f"with a {CONFIG} that is not readable"
-    theirs, ours = (
-        each.model_dump(mode="json", exclude={"output": True, "data": {"in_memory"}})
-        for each in (with_decisions(run, config), with_decisions(config, run))
-    )
+    theirs, ours = _values(with_decisions(run, config)), _values(with_decisions(config, run))
     differences = _differences(theirs, ours)
     return f"which differs in {format_names(differences)}" if differences else ""
+
+
+def _values(config: FitConfig) -> dict[str, object]:
+    """Return all values that determine a fit, without sections of strategies that are not used."""
+    unused = config.densify.sections.keys() - {config.densify.strategy}
+    ignored = {"output": True, "data": {"in_memory"}, "densify": unused}
+    off = {n: True for n, each in config.sections.items() if each.is_off}
+    return config.model_dump(mode="json", exclude={**ignored, **off})
 
 
 def _differences(theirs: object, ours: object, key: str = "") -> list[str]:
     if isinstance(theirs, dict) and isinstance(ours, dict):
         return [
             difference
-            for name in ours
-            for difference in _differences(theirs.get(name), ours[name], f"{key}.{name}".strip("."))
+            for name in {**ours, **theirs}
+            for difference in _differences(
+                theirs.get(name), ours.get(name), f"{key}.{name}".strip(".")
+            )
         ]
     return [] if theirs == ours else [one_line(f"{key} = {theirs} (here {ours})", limit=120)]

@@ -20,9 +20,10 @@ from drgs.config.changes import is_open
 from drgs.config.load import load_config
 from drgs.config.schema import NAMED_COLORS, FitConfig, ModelConfig
 from drgs.core.errors import PluginError, UserError, format_names
-from drgs.core.files import atomic_path
+from drgs.core.files import write_json
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets import Dataset, load_dataset
+from drgs.effects.cameras import CAMERAS, CamerasConfig
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import (
@@ -36,7 +37,7 @@ from drgs.integrator.state import SplatsState
 from drgs.integrator.summary import format_effects, summary_of_views
 from drgs.integrator.types import is_splats
 from drgs.io.images import write_png
-from drgs.results.files import CAMERAS, CONFIG, ERROR_BUDGET, GAUSSIANS
+from drgs.results.files import CONFIG, ERROR_BUDGET, GAUSSIANS
 from drgs.results.folder import relocate_data, require_results
 from drgs.results.refined_cameras import refined_dataset
 
@@ -71,8 +72,7 @@ class ImageFolder:
     def write_budget(self) -> None:
         """Write what an error budget has chosen, if there is one."""
         if self.budget is not None:
-            with atomic_path(self.path / ERROR_BUDGET) as temporary:
-                temporary.write_text(json.dumps(self.budget.record(), indent=2) + "\n")
+            write_json(self.path / ERROR_BUDGET, self.budget.record(), indent=2)
 
     def claim(self, names: Iterable[str], images: Iterable[Image]) -> Iterator[Image]:
         """Yield the images after claiming the files ``names``.
@@ -179,11 +179,11 @@ class Model:
             raise UserError(
                 f"{option}: needs photographs: give the configuration of a fit (--scene CONFIG.yml)"
             )
-        dataset = load_dataset(self.config.data_for_rendering, sections=self.config.extensions)
+        dataset = load_dataset(self.config.data_for_rendering, sections=self.config.sections)
         dataset = dataset.relative_to(self.gaussians.origin)
         if self.folder is None or not (path := self.folder / CAMERAS).is_file():
             return dataset
-        if not self.config.cameras.optimise:
+        if not self.config.section("cameras", CamerasConfig).optimise:
             print(
                 f"cameras: as the dataset has them; those of {path} are used with "
                 "--set cameras.optimise=true"
@@ -249,5 +249,5 @@ def load_open_config(
     if not is_open(config):
         return config
     return resolve_defaults(
-        config, load_dataset(config.data_for_rendering, sections=config.extensions)
+        config, load_dataset(config.data_for_rendering, sections=config.sections)
     )

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,38 +11,14 @@ import numpy as np
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.core.errors import UserError, one_line
-from drgs.core.files import atomic_path, read_text
-from drgs.core.origin import WORLD, Origin
-from drgs.datasets.camera_file import read_viewpoints
-from drgs.datasets.transforms import CLOSE_POSE_KEY, MAX_BYTES
+from drgs.core.files import read_text, write_json
+from drgs.core.origin import Origin
+from drgs.datasets.camera_file import cameras_json, read_viewpoints
+from drgs.datasets.transforms import MAX_BYTES
 from drgs.datasets.types import Dataset, View
-from drgs.results.files import CAMERAS, VIEWS
+from drgs.effects.cameras import CAMERAS, CamerasConfig, LensChange
+from drgs.results.files import VIEWS
 from drgs.results.folder import load_run_config
-
-MODELS = {
-    "opencv": "FULL_OPENCV",
-    "fisheye": "OPENCV_FISHEYE",
-    "thin_prism_fisheye": "THIN_PRISM_FISHEYE",
-}
-"""COLMAP's lens names; other lenses have their registered names."""
-
-
-@dataclass(frozen=True)
-class LensChange:
-    """A refinement of the lens shared by all cameras."""
-
-    focal: tuple[float, float] = (1.0, 1.0)  # factors of fx and fy
-    principal: tuple[float, float] = (0.0, 0.0)  # shift in image widths and heights
-
-    def apply(self, view: View) -> View:
-        """Return the view with this lens."""
-        return replace(
-            view,
-            fx=view.fx * self.focal[0],
-            fy=view.fy * self.focal[1],
-            cx=view.cx + self.principal[0] * view.width,
-            cy=view.cy + self.principal[1] * view.height,
-        )
 
 
 def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
@@ -72,7 +47,7 @@ def refined_viewpoints(folder: Path, origin: Origin) -> list[Viewpoint] | None:
     origin: of their positions, world. Raises :class:`UserError` as ``read_viewpoints``.
     """
     path = folder / CAMERAS
-    if not path.is_file() or not load_run_config(folder).cameras.optimise:
+    if not path.is_file() or not load_run_config(folder).section("cameras", CamerasConfig).optimise:
         return None
     return _read_relative(path, origin)
 
@@ -101,39 +76,6 @@ def _with_pose(view: View, camera_to_world: np.ndarray) -> View:
     return replace(view, camera_to_world=camera_to_world, motion=motion)
 
 
-def cameras_json(views: Iterable[View], origin: Origin) -> dict[str, object]:
-    """Return cameras in the layout of ``transforms.json``, in world coordinates.
-
-    origin: of the views' positions, world; recorded if not zero.
-    """
-    recorded = {"origin": list(origin)} if origin != WORLD else {}
-    frames = [
-        {
-            "file_path": view.name,
-            "transform_matrix": between_opencv_and_opengl(view.camera_to_world).tolist(),
-            **{"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy},
-            **{"w": view.width, "h": view.height},
-            **_lens_and_motion(view),
-        }
-        for view in (view.with_offset(np.array(origin)) for view in views)
-    ]
-    return {**recorded, "frames": frames}
-
-
 def write_views(path: Path, dataset: Dataset) -> None:
     """Write the dataset's cameras of the training views."""
-    with atomic_path(path) as temporary:
-        content = cameras_json(dataset.train, dataset.origin)
-        temporary.write_text(json.dumps(content, indent=1) + "\n")
-
-
-def _lens_and_motion(view: View) -> dict[str, object]:
-    """Return the values of a camera in ``transforms.json`` besides pose and intrinsics."""
-    values: dict[str, object] = {}
-    if view.lens is not None:
-        model = MODELS.get(view.lens.kind, view.lens.kind)
-        values |= {"camera_model": model, **view.lens.coefficients()}
-    if view.motion is not None:
-        values[CLOSE_POSE_KEY] = between_opencv_and_opengl(view.motion.close_to_world).tolist()
-        values["shutter"] = view.motion.shutter
-    return values
+    write_json(path, cameras_json(dataset.train, dataset.origin))

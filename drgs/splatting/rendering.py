@@ -17,10 +17,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import Protocol
 
 import drjit as dr
-from typing_extensions import override
 
 from drgs.cameras.camera import Camera
 from drgs.core.arrays import first_numbers, repeat_array, store_columns, types_of
@@ -61,44 +59,6 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
     return [splats.depths]
 
 
-class ProjectionStage(Protocol):
-    """The source of a frame's splats, and the destination of their derivatives."""
-
-    def project(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
-        """Return the splats of the Gaussians for ``camera``."""
-        ...
-
-    def gradients(
-        self,
-        gaussians: Gaussians,
-        frame: Frame,
-        of_splats: SplatGradients,
-        with_camera: bool,
-    ) -> GaussianGradients:
-        """Return derivatives of the loss, from those with respect to the splats of a frame."""
-        ...
-
-
-@dataclass(frozen=True)
-class DirectProjection(ProjectionStage):
-    """Project the rendered Gaussians, and differentiate the projection."""
-
-    @override
-    def project(self, gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> SplatTable:
-        return project_splats(gaussians, camera, pipeline)
-
-    @override
-    def gradients(
-        self,
-        gaussians: Gaussians,
-        frame: Frame,
-        of_splats: SplatGradients,
-        with_camera: bool,
-    ) -> GaussianGradients:
-        total = gradients_of(gaussians, frame.camera, frame.pipeline, of_splats, with_camera)
-        return replace(total, visible=on_film(frame.tiles.bins))
-
-
 def load_unchanged(rows: GaussianRows) -> GaussianRows:
     """Return the Gaussians unchanged."""
     return rows
@@ -117,7 +77,6 @@ class Pipeline:
     low_pass: float = LOW_PASS  # px^2
     model: ImageModel = DEFAULT
     order: CenterOrder = field(default_factory=CenterOrder)
-    source: ProjectionStage = DirectProjection()
     of_smoothing: bool = False  # whether the smoothing filter is differentiated
 
     def select_differentiable(self, rows: GaussianRows) -> GaussianRows:
@@ -168,7 +127,7 @@ class Frame:
 class GaussianGradients:
     """Derivatives of the loss, shaped like the parameters, and statistics for densification."""
 
-    parameters: Gaussians | None  # None: on the processes that have sent the splats
+    parameters: Gaussians
     means2d: Array2f  # (N,): loss per px
     visible: Bool  # (N,): the Gaussian's extent touches the film
     first_nonfinite: UInt32  # (1,): of ``parameters``, see :func:`decode_nonfinite`
@@ -182,9 +141,14 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
     :func:`drgs.effects.compose.with_effects`. The host reads one value, the number of (splat, tile)
     entries.
     """
+    return render_splats(project_splats(gaussians, camera, pipeline), camera, pipeline)
+
+
+def render_splats(splats: SplatTable, camera: Camera, pipeline: Pipeline) -> Frame:
+    """Render splats that are projected by ``camera`` and ``pipeline``; see :func:`render`."""
     model = pipeline.model.for_camera(camera)
     grid = TileGrid(camera.width, camera.height, model.positions.samples)
-    bins = bin_splats(pipeline.source.project(gaussians, camera, pipeline), grid, model)
+    bins = bin_splats(splats, grid, model)
     order = group_features(pipeline.order.for_camera(camera), bins)
     return Frame(pipeline, camera, order, order.composite(bins, order.records(bins)))
 
@@ -230,6 +194,14 @@ def frames_adjoint(
 
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
+    of_splats = splats_adjoint(frames, d_planes)
+    camera, pipeline = frames[0].camera, frames[0].pipeline
+    gradients = gradients_of(gaussians, camera, pipeline, of_splats, with_camera)
+    return replace(gradients, visible=on_film(frames[0].tiles.bins))
+
+
+def splats_adjoint(frames: list[Frame], d_planes: list[list[Float]]) -> SplatGradients:
+    """Return derivatives with respect to the 2D splats of several frames: see above."""
     total = None
     for frame, of_frame in zip(frames, d_planes, strict=True):
         bins = frame.tiles.bins
@@ -238,7 +210,7 @@ def frames_adjoint(
             samples = range(first, min(first + at_once, bins.grid.samples))
             total = frame.order.adjoint(frame.tiles, of_frame, samples, total)
     assert total is not None, "there is at least one frame"
-    return frames[0].pipeline.source.gradients(gaussians, frames[0], total, with_camera)
+    return total
 
 
 ENTRIES_AT_ONCE = 1 << 19
@@ -381,7 +353,7 @@ def weighted_sums(frame: Frame, *planes: Float) -> list[Float]:
 def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
     """Add the derivatives of a loss that depends on several cameras."""
     total = GaussianGradients(
-        parameters=a.parameters and b.parameters and _sum_of(a.parameters, b.parameters),
+        parameters=_sum_of(a.parameters, b.parameters),
         means2d=a.means2d + b.means2d,
         visible=a.visible | b.visible,
         first_nonfinite=dr.select(

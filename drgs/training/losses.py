@@ -24,7 +24,7 @@ from typing import Any, cast
 import drjit as dr
 from typing_extensions import override
 
-from drgs.config.extensions import LOSS_TERMS, LOSSES, extensions_in_use, section_of
+from drgs.config.extensions import LOSS_TERMS, LOSSES, section_of
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import is_float64, types_of
 from drgs.core.types import ArrayXf, Bool, Float, TensorXf, UInt32
@@ -172,13 +172,13 @@ class PhotometricLoss(Loss):
 def make_loss(config: FitConfig) -> Loss:
     """Return the loss of a configuration."""
     loss = LOSSES.get(config.loss.type, "loss.type")
-    return loss.value.from_config(config, section_of(loss, config.extensions))
+    return loss.value.from_config(config, section_of(loss, config.sections))
 
 
 def make_loss_terms(config: FitConfig) -> list[LossTerm]:
     """Return the terms of the loss that a configuration has sections for."""
-    used = extensions_in_use(config.extensions, LOSS_TERMS)
-    return [each.value.from_config(config, section_of(each, config.extensions)) for each in used]
+    used = [each for each in LOSS_TERMS.all() if each.name in config.sections]
+    return [each.value.from_config(config, section_of(each, config.sections)) for each in used]
 
 
 def l1_loss(image: TensorXf, target: TensorXf) -> Float:

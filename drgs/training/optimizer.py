@@ -1,9 +1,7 @@
-"""Adam over the parameters of the Gaussians, and row surgery on them.
+"""The rows of a fit: the parameters of the Gaussians, with Adam's moments.
 
-``drjit.opt.Adam`` keeps, for each parameter, ``(value, promoted, rate, (t, m, v, v_max))``: the
-step count t and the moments m, v (flat arrays as long as the value). Assigning a value of another
-shape to it discards moments, step count and rate, so every change of the number of Gaussians goes
-through :meth:`Population.edit`, which moves a row's value and moments together.
+Every change of the number of Gaussians goes through :meth:`Population.edit`, which moves a row's
+value and moments together: see :mod:`drgs.core.adam`.
 
 Parameters are named as in ``gaussians.PARAMETER_NAMES``. One of zero size, ``shN`` at degree 0,
 cannot be registered and is not.
@@ -12,137 +10,16 @@ cannot be registered and is not.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
-from drjit.opt import Adam, LearningRate
-from typing_extensions import override
 
-from drgs.core.arrays import Array, from_host, types_of
-from drgs.core.private import new_rate_cache, same_memory
+from drgs.core.adam import LeanAdam
+from drgs.core.arrays import Array, from_host
 from drgs.core.types import Float, UInt32
 from drgs.gaussians.parameters import Gaussians
-
-if TYPE_CHECKING:
-    from drjit.opt import _LRCache
-
-LARGE_WIDTH = 1 << 20  # entries of an array from which on memory is worth saving
-
-
-@dataclass(frozen=True)
-class _Moments:
-    """The moments of a parameter, and aliases by which they are read while they are overwritten.
-
-    Dr.Jit copies an array before it scatters to it, if anything else refers to it, as the new
-    moments do: they refer to aliases, which Dr.Jit takes for other memory.
-    """
-
-    arrays: Sequence[dr.ArrayBase]  # as in the optimizer's state
-    indices: Sequence[int]  # of the arrays: an array has another one if it was assigned to
-    former: tuple[dr.ArrayBase, dr.ArrayBase]  # of the same memory
-
-    def match(self, *arrays: dr.ArrayBase) -> bool:
-        """Return whether these are the moments still."""
-        pairs = zip(self.arrays, self.indices, arrays, strict=True)
-        return all(own is array and index == array.index for own, index, array in pairs)
-
-
-class LeanAdam(Adam):
-    """``drjit.opt.Adam``, to the same bits, with fewer large arrays at a time.
-
-    ``drjit.opt.Adam`` evaluates all new values and moments at once, while the former ones and all
-    gradients are there: seven arrays of each parameter. Here large moments are overwritten, and
-    their gradients cleared when they have been used: five arrays. (On CUDA, memory is free for the
-    next kernel as soon as the last one that uses it is launched, and this is ``drjit.opt.Adam``.)
-    """
-
-    def __init__(self, *arguments: Any, **settings: Any) -> None:
-        """Take the arguments of ``drjit.opt.Adam``."""
-        super().__init__(*arguments, **settings)
-        self._moments: dict[str, _Moments] = {}
-
-    @override
-    def step(
-        self,
-        *,
-        eval: bool = True,
-        grad_scale: LearningRate | None = None,
-        active: dr.ArrayBase | None = None,
-    ) -> None:
-        """Take a step, and clear the gradients of large arrays.
-
-        Waits only in the first step after large moments were assigned. A step that is scaled,
-        masked or not evaluated, or has more than two moments, is that of ``drjit.opt.Adam``.
-        """
-        is_plain = eval and grad_scale is None and active is None
-        if not is_plain or self.mask_updates or self.amsgrad:
-            super().step(eval=eval, grad_scale=grad_scale, active=active)
-            return
-        rates = new_rate_cache()
-        dr.eval([self._update(key, rates) for key in self.state])
-
-    def forget_moments(self) -> None:
-        """Free memory of moments that are the parameters' no longer."""
-        self._moments.clear()
-
-    def _update(self, key: str, rates: _LRCache) -> list[dr.ArrayBase]:
-        """Give a parameter its new state, not evaluated, and return the arrays to evaluate."""
-        value, promoted, rate, (count, first, second, _) = self.state[key]
-        is_large = dr.width(value) >= LARGE_WIDTH and dr.backend_v(value) == dr.JitBackend.LLVM
-        former = first, second
-        if is_large:
-            known = self._moments.get(key)
-            if known is None or not known.match(first, second):
-                former = same_memory(first), same_memory(second)  # waits for the device
-                known = _Moments((first, second), (first.index, second.index), former)
-                self._moments[key] = known
-            former = known.former
-        rate_in_use = self.lr if rate is None else rate
-        flat, gradient = dr.detach(value).array, value.grad.array
-        new, (count, new_first, new_second, _) = self._step(
-            rates, flat, gradient, rate_in_use, (count, *former, None)
-        )
-        new_value = type(value)(new, value.shape) if dr.is_tensor_v(value) else type(value)(new)
-        dr.enable_grad(new_value)
-        if not is_large:
-            self.state[key] = new_value, promoted, rate, (count, new_first, new_second, None)
-            return [new_first, new_second, new]
-        dr.clear_grad(value)
-        element = dr.arange(types_of(type(new)).UInt32, dr.width(new))
-        dr.scatter(first, new_first, element)
-        dr.scatter(second, new_second, element)
-        self.state[key] = new_value, promoted, rate, (count, first, second, None)
-        return [new]  # and by the same kernel the moments, which it reads
-
-
-def make_optimizer(
-    parameters: Mapping[str, dr.ArrayBase],
-    rates: Mapping[str, float],
-    beta_1: float = 0.9,
-    beta_2: float = 0.999,
-    epsilon: float = 1e-15,
-) -> LeanAdam:
-    """Return an Adam optimizer (Kingma and Ba 2015) with a learning rate for each parameter.
-
-    parameters: tensors by name; empty ones are left out.
-    rates: learning rate per step by name. A fixed rate of 0 is allowed.
-    epsilon: 3DGS uses 1e-15, because gradients of a mean over pixels are far below 1e-8.
-    """
-    optimizer = LeanAdam(lr=0.0, beta_1=beta_1, beta_2=beta_2, epsilon=epsilon)
-    for name, value in parameters.items():
-        if name not in rates:
-            raise ValueError(
-                f"make_optimizer(): no learning rate for parameter {name}; rates are given for "
-                f"{', '.join(sorted(rates)) or 'none'}"
-            )
-        if dr.width(value) == 0:
-            continue
-        optimizer[name] = value
-        optimizer.set_learning_rate({name: float(rates[name])})
-    return optimizer
 
 
 @dataclass(frozen=True)
@@ -193,7 +70,7 @@ class Population:
         """Return a number 0 for each row of this process: Float."""
         return dr.zeros(type(self.value("means").array), self.num_local_rows)
 
-    def rows(self, numbers: np.ndarray) -> UInt32:
+    def to_device_indices(self, numbers: np.ndarray) -> UInt32:
         """Return row numbers, (M,) integers on the host, as ``UInt32`` on the device."""
         return from_host(self._index_type, numbers.astype(np.uint32))
 
@@ -313,40 +190,6 @@ class Population:
     ) -> Mapping[str, np.ndarray]:
         """Return the part of a whole state that this process has."""
         return state
-
-
-def optimizer_state(optimizer: Adam) -> dict[str, np.ndarray]:
-    """Return values, moments and step counts, numpy: ``NAME.value``, ``.m``, ``.v``, ``.t``.
-
-    Learning rates are not part of it: they follow from the configuration and the iteration.
-    """
-    state = {}
-    for name, (value, _, _, (step, first, second, _)) in optimizer.state.items():
-        state[f"{name}.value"] = np.array(dr.detach(value))
-        state[f"{name}.m"], state[f"{name}.v"] = np.array(first), np.array(second)
-        state[f"{name}.t"] = np.array(step)
-    return state
-
-
-def pending_gradients(optimizer: Adam) -> dict[str, np.ndarray]:
-    """Return the gradients of a step that is not taken yet, numpy: ``NAME.gradient``."""
-    return {f"{name}.gradient": np.array(dr.grad(value)) for name, value in optimizer.items()}
-
-
-def restore_optimizer(optimizer: Adam, state: Mapping[str, np.ndarray]) -> None:
-    """Continue from :func:`optimizer_state`, and :func:`pending_gradients` if there are any.
-
-    Bit by bit; rates do not change.
-    """
-    for name, (old, promoted, rate, (step, first, second, maximum)) in optimizer.state.items():
-        value = type(old)(state[f"{name}.value"])
-        dr.make_opaque(value)
-        dr.enable_grad(value)
-        if f"{name}.gradient" in state:
-            dr.set_grad(value, type(old)(state[f"{name}.gradient"]))
-        moments = type(first)(state[f"{name}.m"]), type(second)(state[f"{name}.v"])
-        extra = (type(step)(state[f"{name}.t"]), *moments, maximum)
-        optimizer.state[name] = value, promoted, rate, extra
 
 
 def _elements(rows: UInt32, width: int) -> UInt32:

@@ -1,14 +1,15 @@
-"""Stages and steps of a fit: the views of an iteration, their size, and their gradients.
+"""Steps of a fit: the views of an iteration, their size, and their gradients.
 
-A stage trains on images of one size. A step ends with one change of the Gaussians.
+A phase trains on images of one size. A step ends with one change of the Gaussians.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, islice
 
 import numpy as np
 
@@ -18,11 +19,12 @@ from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
 from drgs.datasets.images import shift_pixels, smaller_view
 from drgs.datasets.storage import is_on_disk
 from drgs.datasets.types import View
+from drgs.effects.base import TrainingEffect
 from drgs.integrator.scene import make_sensors
 from drgs.integrator.types import SplatsPlugin
-from drgs.training.effects.base import TrainingEffect, TrainingView
 from drgs.training.losses import TARGET_BYTES
 from drgs.training.rates import LearningRates
+from drgs.training.views import TrainingView
 
 MAX_TARGET_BYTES = 2 << 30
 """Most memory of targets and effects' uploads that stay on the device until their view is drawn
@@ -31,7 +33,7 @@ the file has four times the pixels."""
 
 
 @dataclass(eq=False)
-class Stage:
+class ResolutionPhase:
     """Iterations that train on images of one size."""
 
     until: float  # last iteration
@@ -65,16 +67,16 @@ class Stage:
             self.kept.add(view)
 
     def end(self) -> None:
-        """Free kept targets and uploads: the stage is over."""
+        """Free kept targets and uploads: the phase is over."""
         for view in self.kept:
             view.free()
         self.kept.clear()
 
 
-def make_stages(
+def make_phases(
     views: tuple[View, ...], config: FitConfig, effects: Sequence[TrainingEffect], room: int
-) -> list[Stage]:
-    """Return the configuration's coarse stages, and the last one with full images.
+) -> list[ResolutionPhase]:
+    """Return the phases of the configuration: coarse ones, and the last one with full images.
 
     room: bytes of targets and uploads that may stay on the device. None do where photographs are
     on disk: what is read ahead costs no time.
@@ -82,17 +84,35 @@ def make_stages(
     room = 0 if any(map(is_on_disk, views)) else min(room, MAX_TARGET_BYTES)
     sizes = [(s.until, [smaller_view(v, s.factor) for v in views]) for s in config.coarse]
     is_refined = any(effect.moves_sensors for effect in effects)
-    window = config.loss.window, config.loss.sigma
-    stages = []
+    phases = []
     for until, resized in [*sizes, (math.inf, views)]:
         shifted = [(view,) if is_refined else shift_pixels(view) for view in resized]
         sensors = iter(make_sensors(list(chain(*shifted)), calibrated=is_refined))
         training_views = [
-            [TrainingView(view, index, next(sensors), effects, window) for view in views_of_one]
+            [TrainingView(view, index, next(sensors), effects) for view in views_of_one]
             for index, views_of_one in enumerate(shifted)
         ]
-        stages.append(Stage(until, training_views, bytes_per_pixel(effects), room))
-    return stages
+        phases.append(ResolutionPhase(until, training_views, bytes_per_pixel(effects), room))
+    return phases
+
+
+NUM_AHEAD = 2  # views that are read besides that of the iteration
+
+
+class ReadAhead:
+    """Reads the next photographs that a process renders, if they are on disk, in a thread."""
+
+    def __init__(self, views: Sequence[View], own: Collection[int]) -> None:
+        """views: the training views; own: indices of those that this process renders."""
+        self._own = {index for index in own if is_on_disk(views[index])}
+        self._thread = ThreadPoolExecutor(1, "read-ahead")  # starts with its first task
+
+    def __call__(self, coming: Iterable[TrainingView]) -> None:
+        """Start to read the first of the coming views; an error is raised where one is used."""
+        if self._own:
+            own = (view for view in coming if view.index in self._own)
+            for view in islice(own, 1 + NUM_AHEAD):
+                view.read_ahead(self._thread)
 
 
 def bytes_per_pixel(effects: Sequence[TrainingEffect]) -> int:
@@ -114,8 +134,8 @@ class Step:
     """The iterations between two changes of the Gaussians, one for each view."""
 
     iterations: range
-    stage: Stage  # of the image size that is in use
-    begins_stage: bool
+    phase: ResolutionPhase  # of the image size that is in use
+    begins_phase: bool
     views: tuple[StepView, ...]  # by iteration
     num_averaged: int  # batch size
     is_update: bool  # whether the optimizer steps at its end
@@ -127,23 +147,23 @@ class Step:
 
 
 def plan_step(
-    iteration: int, config: FitConfig, rates: LearningRates, stages: Sequence[Stage]
+    iteration: int, config: FitConfig, rates: LearningRates, phases: Sequence[ResolutionPhase]
 ) -> Step:
     """Return the step that an iteration is part of; iteration 0 is the start of a fit."""
     views_per_step = config.optimizer.views_per_step
     iterations = step_of(iteration, views_per_step, config.iterations)
     first, last = iterations[0], iterations[-1]
-    stage = next(stage for stage in stages if first <= stage.until)
+    phase = next(phase for phase in phases if first <= phase.until)
     is_late = rates.means.progress(first) > config.optimizer.views_from
     is_settled = first >= config.densify.first_fixed_iteration(config.iterations)
     late_views = config.optimizer.views if is_late and is_settled else 1
-    order = len(stage.shifted), config.seed, views_per_step
+    order = len(phase.shifted), config.seed, views_per_step
     return Step(
         iterations=iterations,
-        stage=stage,
-        begins_stage=any(first - views_per_step <= each.until < first for each in stages),
+        phase=phase,
+        begins_phase=any(first - views_per_step <= each.until < first for each in phases),
         views=tuple(
-            StepView(i, i - first, stage.view(view_of(i, *order), i)) for i in iterations if i > 0
+            StepView(i, i - first, phase.view(view_of(i, *order), i)) for i in iterations if i > 0
         ),
         num_averaged=max(late_views, len(iterations)),
         is_update=late_views <= views_per_step or last % late_views == 0,
@@ -195,10 +215,10 @@ class ViewLoss:
     counted: float  # share of the pixels that count
 
 
-class WholeGradients:
-    """Steps of one view, with the gradients that ``dr.backward`` stores in the parameters.
+class OneView:
+    """The gradients of steps of one view, which ``dr.backward`` leaves in the parameters.
 
-    Steps of several views use :class:`drgs.training.parallel.exchange.ViewExchange`.
+    :class:`drgs.training.parallel.several_views.SeveralViews` has those of longer steps.
     """
 
     def __init__(self, integrator: SplatsPlugin) -> None:
@@ -206,7 +226,7 @@ class WholeGradients:
         self._views: Sequence[StepView] = ()
         self._sums: Mapping[str, Float] = {}
 
-    def begin(self, views: Sequence[StepView], place: Callable[[StepView], None]) -> None:
+    def begin(self, views: Sequence[StepView], move_sensor: Callable[[StepView], None]) -> None:
         """Start a step of one view."""
         self._views = views
 
@@ -214,7 +234,10 @@ class WholeGradients:
         """Return the step's view."""
         return self._views
 
-    def end_view(self, weights: Mapping[str, Float]) -> None:
+    def begin_view(self, view: StepView) -> None:
+        """Do nothing: the integrator renders its own Gaussians."""
+
+    def end_view(self, view: StepView, weights: Mapping[str, Float]) -> None:
         """Keep the weighted sums of the view."""
         last = self.integrator.last
         self._sums = {name: last.weighted_sums(plane) for name, plane in weights.items()}

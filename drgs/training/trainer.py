@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import cast
@@ -18,51 +18,50 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.config.schema import FitConfig
-from drgs.core.memory import release_unused_memory
-from drgs.core.types import Float, TensorXf
-from drgs.datasets.types import Dataset, View
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.initialization.defaults import resolve_defaults
-from drgs.integrator.scene import make_scene, render_views
-from drgs.integrator.types import SplatsPlugin
-from drgs.splatting.rendering import NO_FAULT
-from drgs.training.density.strategy import (
-    DensityReport,
-    DensityStrategy,
-    PixelWeight,
-    StepInfo,
-    density_strategy,
-)
-from drgs.training.effects.base import (
-    FitState,
-    TrainingEffect,
-    TrainingView,
-    integrator_settings,
-    training_effects,
-)
-from drgs.training.finite_checks import GradientWatch, WatchedIteration, check_values
-from drgs.training.losses import Loss, make_loss, make_loss_terms
-from drgs.training.optimizer import (
+from drgs.core.adam import (
     make_optimizer,
     optimizer_state,
     pending_gradients,
     restore_optimizer,
 )
+from drgs.core.memory import release_unused_memory
+from drgs.core.types import Float, TensorXf
+from drgs.datasets.types import Dataset, View
+from drgs.effects.base import TrainingEffect, integrator_settings, training_effects
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.initialization.defaults import resolve_defaults
+from drgs.integrator.scene import make_scene, render_views
+from drgs.integrator.types import SplatsPlugin
+from drgs.splatting.rendering import NO_FAULT
+from drgs.training.density.phases import density_strategy
+from drgs.training.density.strategy import (
+    DensityReport,
+    DensityStrategy,
+    PixelWeight,
+    StepInfo,
+)
+from drgs.training.finite_checks import GradientWatch, WatchedIteration, check_values
+from drgs.training.losses import Loss, make_loss, make_loss_terms
 from drgs.training.parallel.communicator import Communicator
-from drgs.training.parallel.population import check_shardable, local_gaussians, make_population
-from drgs.training.rates import rates_over_time, revised_plan
-from drgs.training.read_ahead import ReadAhead
+from drgs.training.parallel.population import (
+    check_shardable,
+    local_gaussians,
+    make_population,
+    own_views,
+)
+from drgs.training.rates import rates_over_time
 from drgs.training.steps import (
     MAX_TARGET_BYTES,
+    OneView,
+    ReadAhead,
     Step,
     StepView,
     ViewGradients,
     ViewLoss,
-    WholeGradients,
-    bytes_per_pixel,
-    make_stages,
+    make_phases,
     plan_step,
 )
+from drgs.training.views import FitState, TrainingView
 
 DENSITY = "density/"  # precedes the names of the strategy's state
 
@@ -106,12 +105,12 @@ class Trainer:
         effects: Sequence[TrainingEffect] = (),
         loss: Loss | None = None,
         *,
-        room: Callable[[int], int] = lambda pixel_bytes: MAX_TARGET_BYTES,
+        room: int = MAX_TARGET_BYTES,
     ) -> None:
         """gaussians: all, on each process; comm: None: this process alone.
 
         density, loss: None: the configured ones; effects: besides the configured ones. room: bytes
-        of targets and uploads that may stay on the device, given those of a pixel.
+        of targets and uploads that may stay on the device.
         """
         config = resolve_defaults(config, dataset)
         views_per_step = config.optimizer.views_per_step
@@ -121,7 +120,6 @@ class Trainer:
         self.effects = training_effects(config, dataset, effects)
         self._given_density, self._given_effects, self._given_loss = density, effects, loss
         self._room = room
-        room_bytes = comm.collective(lambda: room(bytes_per_pixel(self.effects)))
         self.scene = make_scene(
             local_gaussians(gaussians, comm),
             config.model,
@@ -137,17 +135,17 @@ class Trainer:
             self.rates(0),
             beta_1=config.optimizer.beta_1**views_per_step,
             beta_2=config.optimizer.beta_2**views_per_step,
-            epsilon=config.optimizer.epsilon,
         )
         self.loss = loss or make_loss(config)
         self.terms = make_loss_terms(config)
-        self.stages = make_stages(dataset.train, config, self.effects, room_bytes)
-        self.read_ahead = ReadAhead(dataset.train, views_per_step, comm)
-        self.gradients: WholeGradients | ViewExchange = WholeGradients(self.integrator)
+        self.phases = make_phases(dataset.train, config, self.effects, room)
+        own = own_views(len(dataset.train), views_per_step, comm.rank, comm.size)
+        self.read_ahead = ReadAhead(dataset.train, own)
+        self.gradients: OneView | SeveralViews = OneView(self.integrator)
         if views_per_step > 1:
-            from drgs.training.parallel.exchange import ViewExchange
+            from drgs.training.parallel.several_views import SeveralViews
 
-            self.gradients = ViewExchange(comm, self.integrator, self.params, views_per_step)
+            self.gradients = SeveralViews(comm, self.integrator, self.params, views_per_step)
         self.population = make_population(
             self.optimizer, self.extent, config.seed, comm, gaussians.num_gaussians
         )
@@ -159,10 +157,17 @@ class Trainer:
     def step(self) -> StepReport:
         """Render the views of a step, one per iteration, and step along their mean gradient."""
         step = self._begin_step()
+        self.params.update(self.optimizer)
+        self._begin_effects(step)
         penalties = self._differentiate_penalties(step)
         losses: dict[int, ViewLoss] = {}
         for view in self.gradients.own_views():
-            losses[view.place] = self._differentiate(step, view)
+            self._begin_view(step, view)
+            rendered = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
+            image, loss, error = self.compare(cast(TensorXf, rendered), view.view)
+            dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
+            self._end_view(view, dr.detach(image))
+            losses[view.place] = ViewLoss(dr.detach(loss), error, view.view.counted_share)
         gradients = self.gradients.finish([tuple(self._pixel_weights(i)) for i in step.iterations])
         views = self._total_losses(step, gradients, losses, penalties)
         if step.is_update:
@@ -171,51 +176,53 @@ class Trainer:
         self._update_effects(step)
         report = self._control_density(step, gradients)
         for place in losses:
-            step.stage.keep_or_free(step.views[place].view)
+            step.phase.keep_or_free(step.views[place].view)
         means_lr = self.rates.means(step.last_iteration)
         return StepReport(step.last_iteration, self.num_gaussians, means_lr, report, tuple(views))
 
-    def _differentiate(self, step: Step, view: StepView) -> ViewLoss:
-        """Render a view, and add the derivatives of its loss to the step's."""
+    def _begin_step(self) -> Step:
+        """Plan the next step."""
+        before, step = self.last_step, self.plan(self.iteration + 1)
+        if step.phase is not before.phase:
+            before.phase.end()
+        self.iteration = step.last_iteration
+        self.integrator.sh_degree = self.sh_degree_at(step.iterations[0])
+        return step
+
+    def _begin_effects(self, step: Step) -> None:
+        """Bring effects, and the sensors of views of other ranks, to where they are now."""
+        fit = self.fit_state(step, step.iterations[0])
+        for effect in self.effects:
+            effect.begin(fit)
+
+        def move_sensor(view: StepView) -> None:
+            for effect in self.effects:
+                if effect.moves_sensors:
+                    effect.before_render(fit, view.view)
+
+        self.gradients.begin(step.views, move_sensor)
+
+    def _begin_view(self, step: Step, view: StepView) -> None:
+        """Let effects prepare a view's sensor and background, and a thread read the next ones."""
         self.read_ahead(self._coming_views(step, view.iteration))
         fit = self.fit_state(step, view.iteration)
         for effect in self.effects:
             effect.before_render(fit, view.view)
-        rendered = mi.render(self.scene, self.params, sensor=view.view.sensor, spp=1)
-        image, loss, error = self.compare(cast(TensorXf, rendered), view.view)
-        dr.backward(loss / step.num_averaged if step.num_averaged > 1 else loss)
-        image, photograph = dr.detach(image), view.view.target.image
-        weights = self._pixel_weights(view.iteration)
-        self.gradients.end_view({name: weigh(image, photograph) for name, weigh in weights.items()})
-        return ViewLoss(dr.detach(loss), error, view.view.counted_share)
+        self.gradients.begin_view(view)
+
+    def _end_view(self, view: StepView, image: TensorXf) -> None:
+        """Compute what the strategy sums over the pixels of each Gaussian."""
+        photograph, weights = view.view.target.image, self._pixel_weights(view.iteration)
+        planes = {name: weigh(image, photograph) for name, weigh in weights.items()}
+        self.gradients.end_view(view, planes)
 
     def _coming_views(self, step: Step, iteration: int) -> Iterator[TrainingView]:
         """Yield the views of the fit from an iteration of ``step`` on."""
         while True:
             yield from (each.view for each in step.views if each.iteration >= iteration)
-            if step.last_iteration >= self.config.iterations:
+            if step.last_iteration >= self.config.last_iteration:
                 break
             step = self.plan(step.last_iteration + 1)
-
-    def _begin_step(self) -> Step:
-        """Plan the next step, and bring the scene to where the optimizer is."""
-        before, step = self.last_step, self.plan(self.iteration + 1)
-        if step.stage is not before.stage:
-            before.stage.end()
-        self.iteration = step.last_iteration
-        self.integrator.sh_degree = self.sh_degree_at(step.iterations[0])
-        self.params.update(self.optimizer)
-        fit = self.fit_state(step, step.iterations[0])
-        for effect in self.effects:
-            effect.begin(fit)
-
-        def place(view: StepView) -> None:
-            for effect in self.effects:
-                if effect.moves_sensors:
-                    effect.before_render(fit, view.view)
-
-        self.gradients.begin(step.views, place)
-        return step
 
     def _differentiate_penalties(self, step: Step) -> Sequence[Float | np.ndarray]:
         """Add the derivatives of the strategy's terms of the loss; return the terms."""
@@ -324,7 +331,7 @@ class Trainer:
 
     def plan(self, iteration: int) -> Step:
         """Return the step that an iteration is part of."""
-        return plan_step(iteration, self.config, self.rates, self.stages)
+        return plan_step(iteration, self.config, self.rates, self.phases)
 
     def fit_state(self, step: Step | None = None, iteration: int | None = None) -> FitState:
         """Return the state for effects, by default after the last step."""
@@ -333,11 +340,11 @@ class Trainer:
         return FitState(
             iteration=iteration,
             iterations_of_step=step.iterations,
-            begins_stage=step.begins_stage,
+            begins_phase=step.begins_phase,
             rate_decay=self.rates.means(iteration) / self.rates.means.initial,
             integrator=self.integrator,
             means=cast(TensorXf, self.optimizer["means"]),
-            views=step.stage.views,
+            views=step.phase.views,
             effects=self.effects,
         )
 
@@ -359,7 +366,7 @@ class Trainer:
     @property
     def views(self) -> list[TrainingView]:
         """The training views, at the image size that is in use."""
-        return self.last_step.stage.views
+        return self.last_step.phase.views
 
     @property
     def sh_degree(self) -> int:
@@ -439,31 +446,15 @@ class Trainer:
 
     def warm_start(self, former: Trainer) -> None:
         """Begin after the iterations of another trainer, with the state of its effects."""
-        before, views_per_step = former.config.iterations, former.config.optimizer.views_per_step
+        before, views_per_step = former.iteration, former.config.optimizer.views_per_step
         self.iteration = -(-before // views_per_step) * views_per_step  # a step begins after it
         self._restore_effects({effect.name: effect.state() for effect in former.effects})
 
     def release(self) -> None:
         """Free memory that only iterations need; the scene still renders the fit's Gaussians."""
-        self.last_step.stage.end()
+        self.last_step.phase.end()
         self.optimizer.state.clear()
         release_unused_memory()
-
-    def reschedule(self, iterations: int, densify_stop: int) -> None:
-        """Change the last iteration of the fit, and of changes of the population.
-
-        The configuration becomes one which would have given the fit so far. Raises ValueError where
-        there is none.
-        """
-        config, now = self.config, self.iteration
-        if densify_stop != config.densify.stop and now >= min(densify_stop, config.densify.stop):
-            raise ValueError(
-                f"Trainer.reschedule(): densify.stop cannot change from {config.densify.stop} to "
-                f"{densify_stop} after iteration {now}"
-            )
-        self.config = revised_plan(config, now, iterations, densify_stop)
-        self.rates = rates_over_time(self.config, self.extent)
-        self.density = self._density_from(self.density.state())
 
     def state(self) -> dict[str, np.ndarray]:
         """Return everything that the coming iterations depend on, as numpy arrays.

@@ -1,4 +1,4 @@
-"""``drgs view``: Gaussians in a browser, rendered live.
+"""Look at Gaussians in a browser, rendered live.
 
 May import everything but other commands.
 """

@@ -35,6 +35,7 @@ from drgs.cli.execution import select_variant
 from drgs.config.changes import with_changes
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
+from drgs.core.adam import LeanAdam
 from drgs.core.types import Float, UInt32
 from drgs.datasets import load_dataset
 from drgs.datasets.types import View, evenly_spaced
@@ -46,7 +47,7 @@ from drgs.results.metrics import psnr
 from drgs.training.density.budget import GROWTH_SHARE, GrowthToNumber
 from drgs.training.density.strategy import DensityReport
 from drgs.training.losses import Loss, LossTerm, PhotometricLoss
-from drgs.training.optimizer import LeanAdam, Population
+from drgs.training.optimizer import Population
 from drgs.training.steps import Stage
 from drgs.training.trainer import Trainer
 from fits import SCENES as SCENES_FOLDER

@@ -38,7 +38,6 @@ Values = Mapping[str, object]
 PAPER: Values = {
     "init.start": "random",
     "init.opacity": 0.1,
-    "init.scale": 1.0,
     "model.sh_degree": 3,
     "model.alpha_cut": 1 / 255,
     "model.low_pass": 0.3,
@@ -56,10 +55,7 @@ PAPER: Values = {
     "optimizer.views_per_step": 1,
     "optimizer.views": 1,
     "optimizer.views_from": 0.75,
-    "optimizer.epsilon": 1e-15,
     "loss.dssim_weight": 0.2,
-    "loss.window": 11,
-    "loss.sigma": 1.5,
     "densify.strategy": "adc",
     "densify.every": 100,
     "densify.max_gaussians": 1_000_000,

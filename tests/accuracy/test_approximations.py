@@ -104,7 +104,7 @@ def test_without_transmittance_stop_gradients_exist_behind_opaque_layers():
     [
         (
             {"projection": "affine"},
-            "projection must be one of ewa, unscented, exact \\(others come with",
+            "projection must be one of ewa, exact, unscented \\(others come with",
         ),
         ({"order": "entry"}, "order must be one of center, pixel \\(others come with"),
         ({"order_window": 0}, "order_window must be from 1 to 64, got 0"),

@@ -14,9 +14,8 @@ from drgs.cameras.camera import Camera
 from drgs.cameras.lens import LENSES, Lens, Pinhole
 from drgs.core.errors import UserError
 from drgs.core.registry import ExtensionError, reporting_extensions, temporary_registrations
-from drgs.datasets.camera_file import read_viewpoints
+from drgs.datasets.camera_file import cameras_json, read_viewpoints
 from drgs.datasets.film import to_film
-from drgs.results.refined_cameras import cameras_json
 from drgs.testing import Case, laws_of
 
 with temporary_registrations():

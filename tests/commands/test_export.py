@@ -315,7 +315,7 @@ def test_up_direction_uses_refined_cameras(fit, optimise):
 
 TO_SPZ = ("model.ply", "--format", "spz")
 REFUSED = [
-    (("model.ply",), "one of ply, compressed-ply, spz, sog, glb, splat, usd, html, mesh, got none"),
+    (("model.ply",), "one of compressed-ply, glb, ply, sog, splat, spz, usd, html, mesh, got none"),
     (("model.ply", "--format", "splt"), "got splt; did you mean splat?"),
     (("model.ply", "--out", "a.obj"), "--format: must be one of"),
     ((*TO_SPZ, "--out", "a.glb"), "name of a spz file must end in .spz"),

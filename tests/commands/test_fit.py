@@ -212,8 +212,7 @@ def test_the_first_interrupt_saves_and_the_second_ends_without_a_traceback(
 def test_budget_reserves_time_for_results_or_skips_them(monkeypatch):
     """The clock stands still; results take 6 s, report and images 4 s, a file for viewers 4 s."""
     changes = {
-        "seconds_of_results": lambda *_: Seconds(6.0, viewers=4.0, renders=1.0, report=1.0),
-        "seconds_of_curves": lambda: 2.0,
+        "seconds_of_results": lambda *_: Seconds(6.0, viewers=4.0, renders=1.0, report=3.0),
         "make_plan": lambda config, *_: make_dataclass("Plan", ["config", "end"])(config, 0.0),
         "time": SimpleNamespace(perf_counter=lambda: 0.0),
     }

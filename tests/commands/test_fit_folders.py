@@ -1,7 +1,7 @@
 """Folders of ``drgs.fit``: what others wrote stays, and a fit goes on wherever it is moved to.
 
-It also goes on whenever it was killed. The clock of a fit with a budget is replaced: its plan is
-revised after iterations that are given.
+It also goes on whenever it was killed. The clock of a fit with a budget is replaced: it ends
+after an iteration that is given.
 """
 
 import json
@@ -28,16 +28,12 @@ from support.small_capture import blobs
 from drgs.config.load import load_config
 from drgs.core.folders import sole_writer
 from drgs.fit import session
-from drgs.fit.loop import StopCriterion
 from drgs.render import __main__ as render
 from drgs.results.folder import continue_run
 
 POINTS = "out/point_cloud.ply"
 
-PLANS = {2: 10, 3: 9, 5: 8}
-"""Total number of iterations of the plan revised at each iteration; the clock ends it after 7."""
-
-LAST = 7
+LAST = 7  # iteration after which the clock ends a fit
 
 RESULTS = {
     *("config.yml", "point_cloud.ply", "history.csv", "density.csv", "views.json"),
@@ -50,19 +46,6 @@ BUDGET = ("--budget", "60s")
 
 class Killed(BaseException):
     """An exception that no code handles."""
-
-
-class Revised(StopCriterion):
-    """The length of a fit whose plan changes on the way."""
-
-    def __init__(self, *_):
-        pass
-
-    def should_continue(self, trainer):
-        done = trainer.iteration
-        if done in PLANS or done == LAST:
-            trainer.reschedule(PLANS.get(done, LAST), trainer.config.densify.stop)
-        return done < LAST
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +89,8 @@ def quick(monkeypatch):
 
     plan = partial(SimpleNamespace, reasons="planned", chosen=Mock(), end=0.0)
     monkeypatch.setattr(session, "plan_fit", lambda config, *_: plan(config=config))
-    monkeypatch.setattr(session, "rehearse", lambda *_: (Mock(), 1.0))
-    monkeypatch.setattr(session, "Deadline", Revised)
+    monkeypatch.setattr(session, "rehearse", lambda *_, **__: (Mock(), 1.0))
+    monkeypatch.setattr(session, "deadline", lambda *_: lambda trainer: trainer.iteration < LAST)
 
 
 def assert_as_uninterrupted(folder, projects):
@@ -313,20 +296,16 @@ def assert_done(out):
     """All is there and nothing else, and ``config.yml`` says what was done."""
     assert visible(out) - {"plan.txt"} == RESULTS
     rows = (out / "history.csv").read_text().splitlines()
-    assert len(rows) == load_config(out / "config.yml").iterations + 1
+    assert len(rows) == load_config(out / "config.yml").last_iteration + 1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("behind", [False, True])
 @pytest.mark.parametrize("budget", [(), BUDGET], ids=["plain", "budget"])
 def test_fit_killed_at_any_file_resumes(config, tmp_path, budget, behind):
-    """Also between the two files of a revised plan, and behind the last file."""
+    """Also behind the last file."""
     _, names = run_crashing_fit(None, False, config, "--out", tmp_path / "whole", *budget)
     assert_done(tmp_path / "whole")
-    if budget:
-        saved = [moment for moment, name in enumerate(names) if name == "checkpoint.npz"]
-        # After iterations 2, 4, 6 and 7.
-        assert [names[moment + 1] for moment in saved] == ["config.yml"] * 4
     for moment in range(len(names)):
         out, again = tmp_path / f"{moment}", tmp_path / f"again {moment}"
         was_killed, names = run_crashing_fit(moment, behind, config, "--out", out, *budget)

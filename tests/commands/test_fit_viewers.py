@@ -30,7 +30,7 @@ from drgs.datasets import load_dataset
 from drgs.fit import __main__ as fit
 from drgs.fit import fit_folder
 from drgs.fit import live_view as training_viewer
-from drgs.fit.live_view import EarlyStop, TrainingViewer
+from drgs.fit.live_view import TrainingViewer, unless_ended
 from drgs.gaussians.parameters import Gaussians
 from drgs.live_page.frames import FrameRequest, ViewerCamera
 from drgs.live_page.scheduler import RenderRequests
@@ -64,8 +64,8 @@ def viewer_page(monkeypatch):
         screen.show.side_effect = ask
         screen.show_progress.side_effect = lambda t, *_: t.iteration == 4 and queue.end()
         ask()
-        length = EarlyStop(length, queue)
-        return TrainingViewer(queue, screen, dataset, length), length
+        length = unless_ended(length, queue)
+        return TrainingViewer(queue, screen, dataset), length
 
     monkeypatch.setattr(training_viewer, "watch", watch)
     return screen
@@ -94,8 +94,8 @@ def test_ending_early_leaves_a_finished_fit(tmp_path, viewer_page, monkeypatch, 
     assert viewer_page.show.call_count == 5
     assert ("finished" in assert_fits("--resume", out).stdout) != killed
     metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["iterations"] == metrics["config"]["iterations"] == 5
-    assert load_config(out / "config.yml").iterations == 5
+    assert metrics["iterations"] == metrics["config"]["stop_after"] == 5
+    assert load_config(out / "config.yml").last_iteration == 5
     assert not (out / "checkpoint.npz").exists()
     assert_fits(out / "config.yml", "--out", tmp_path / "again")
     assert files_of(tmp_path / "again") == files_of(out)

@@ -296,7 +296,7 @@ REFUSED = [
     ({"render_mode": "depth"}, "render_mode must be one of .*, got 'depth'"),
     ({"width": 0}, "width and height must be 1 px or more"),
     ({"eps2d": -1.0}, "eps2d must be finite and not negative, got -1.0"),
-    ({"projection": "affine"}, "projection must be one of ewa, unscented, exact"),
+    ({"projection": "affine"}, "projection must be one of ewa, exact, unscented"),
     ({"packed": False}, "packed is a parameter of gsplat's .*; leave it out"),
     ({"with_ut": True}, 'with_ut is .*; give projection="unscented"'),
     ({"projektion": "ewa"}, "no parameter projektion; did you mean projection"),

@@ -35,7 +35,7 @@ SKY = REPOSITORY / "scenes" / "images" / "tiles.png"
 WRONG_WORDS = [
     (("nowhere.ply",), "there is no such file or folder"),
     (("../data",), "there is no config.yml in it"),
-    (("config.yml",), "must be a file of Gaussians (.ply, .compressed.ply, .spz,"),
+    (("config.yml",), "must be a file of Gaussians (.compressed.ply, .glb, .ksplat,"),
     ((PLY,), "choose the cameras: --orbit N"),
     ((PLY, "--split", "test"), "needs photographs"),
     ((PLY, "--orbit", 2, "--data", "x"), "--orbit but without --scene"),

@@ -50,7 +50,10 @@ def test_images_with_alpha_use_lego_yml():
     assert "cut-out images in the layout of NeRF-synthetic, as they are" in reasons
 
 
-def test_transforms_json_is_recognised(photographs):
+@pytest.mark.parametrize("with_model", [False, True])
+def test_transforms_json_is_recognised_also_beside_a_model_of_colmap(photographs, with_model):
+    if with_model:
+        write_dataset(photographs)
     config, reasons = config_for(photographs)
     assert config.data.type == "nerfstudio" and config.data.image_size == 8
     assert "cameras of transforms.json" in reasons

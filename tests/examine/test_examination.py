@@ -19,10 +19,10 @@ import drgs
 from drgs.config.extensions import EFFECTS
 from drgs.config.load import config_from
 from drgs.core.registry import temporary_registrations
+from drgs.effects.base import Finding, TrainingEffect
+from drgs.effects.colors import exposure_spread
 from drgs.examine import __main__ as command
 from drgs.examine.examination import Examination, decide, given_keys, overlaps, split_views
-from drgs.training.effects.base import TrainingEffect
-from drgs.training.findings import Finding, exposure_spread
 
 ITERATIONS = 1500  # of a fit: the fewest that are examined
 NAMES = ["background of one colour", "exposure and white balance", "camera refinement"]
@@ -102,19 +102,17 @@ def test_given_values_are_not_examined_and_effects_from_outside_are(dataset):
         class Mine(TrainingEffect):
             """Changes nothing."""
 
-            name = "mine"
-
             @classmethod
             def look_for(cls, fit):
                 assert len(fit.images) == len(fit.dataset.test) == len(fit.alignments)
-                return Finding("mine", "to be tried", True, {"extensions.mine": None})
+                return Finding("mine", "to be tried", True, {"mine": None})
 
         given = {"colors": {"lr": 0.02}, "cameras": {"optimise": False}}
         found = drgs.examine(dataset, config_of(**given))
         background, mine = sorted(found.decisions, key=lambda each: each.effect)
         assert (background.effect, background.gain) == (NAMES[0], None)
         assert (mine.effect, mine.gain, mine.chosen) == ("mine", 0.0, False)
-        found = drgs.examine(dataset, config_of(**given, extensions={"mine": None}))
+        found = drgs.examine(dataset, config_of(**given, mine=None))
         assert [each.effect for each in found.decisions] == NAMES[:1]
 
 
@@ -150,8 +148,8 @@ def test_keys_that_are_given(values, key, is_given):
 
 
 def test_keys_overlap_with_their_sections():
-    assert overlaps("extensions.mine", "extensions.mine.rate")
-    assert overlaps("extensions.mine.rate", "extensions.mine") and overlaps("a.b", "a.b")
+    assert overlaps("mine", "mine.rate")
+    assert overlaps("mine.rate", "mine") and overlaps("a.b", "a.b")
     assert not overlaps("colors.lr", "colors.lr_decay")
 
 

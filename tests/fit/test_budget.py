@@ -4,11 +4,11 @@ import time
 from argparse import ArgumentTypeError
 from dataclasses import replace
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from support.fit_command import assert_fits, run_fit, write_scene
+from support.trainers import make_trainer
 
 from drgs.config.changes import with_changes
 from drgs.config.load import load_config
@@ -16,14 +16,8 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.fit import __main__ as fit
 from drgs.fit import budget as plan
-from drgs.fit import checkpoint
-from drgs.fit.budget import Curve, Deadline, Strategy, load_curves, make_plan, parse_duration
-from drgs.fit.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from drgs.fit.fingerprint import Fingerprint
-from drgs.fit.loop import History
-from drgs.results.folder import load_run_config
-from drgs.training.rates import rates_over_time
-from drgs.training.trainer import Trainer
+from drgs.fit.budget import Curve, Strategy, deadline, load_curves, make_plan, parse_duration
+from drgs.fit.loop import History, iterations
 
 
 @pytest.mark.parametrize(
@@ -135,91 +129,38 @@ def test_fraction_is_planned_only_with_a_target_number():
 
 
 def test_configuration_that_cannot_shrink_gets_a_plan():
-    """Stages of its own, which stay, few iterations of changes, revisions of an earlier plan."""
+    """Stages of its own, which stay, few iterations of changes, the end of an earlier plan."""
     values = {"coarse": [{"until": 10, "factor": 4}, {"until": 20, "factor": 2}]}
     values |= {"densify.start": 500, "densify.stop": 501}
-    values |= {"optimizer.means_lr_aims": [{"after": 0, "end": 5}, {"after": 1, "end": 7}]}
-    config = with_changes(CONFIG, values)
+    config = with_changes(CONFIG, values | {"stop_after": 7})
     result = make_plan(config, 50, 400, 25, 0.1, curves_of())
     assert result.chosen.strategy is plan.STRATEGIES[0]
-    assert result.config.iterations == 250 and result.config.optimizer.means_lr_aims == []
+    assert result.config.iterations == result.config.last_iteration == 250
     assert (result.config.densify.start, result.config.densify.stop) == (18, 19)
     assert [(s.until, s.factor) for s in result.config.coarse] == [(1, 4)]
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """Instead of time.perf_counter: seconds that a test decides."""
+@pytest.mark.parametrize("last", [4, 6, 9])
+def test_clock_ends_a_fit_and_its_configuration_gives_the_same_bytes(monkeypatch, last):
+    """A fit that was planned for 6 iterations; the others run at the final rates."""
     clock = SimpleNamespace(now=100.0)
     clock.perf_counter = lambda: clock.now
     monkeypatch.setattr(plan, "time", clock)
-    return clock
+    trainer = make_trainer(iterations=6)
+    for done in iterations(trainer, History(), deadline(100.0 + last, trainer.comm)):
+        clock.now += 1.0
+        assert done.is_last == (trainer.iteration == last + 1)
+    assert trainer.config.iterations == 6 and trainer.config.last_iteration == last + 1
+    again = make_trainer(**trainer.config.model_dump())
+    assert len(list(iterations(again, History()))) == last + 1
+    expected, state = trainer.state(), again.state()
+    assert all(np.array_equal(state[name], values) for name, values in expected.items())
 
 
-class FakeTrainer:
-    """A trainer's count of iterations; an iteration takes ``second``."""
-
-    reschedule, extent, iteration = Trainer.reschedule, 1.0, 0
-
-    def __init__(self, clock, second, **changes):
-        self.clock, self.second = clock, second
-        values = {"iterations": 1000, "densify.start": 100, "densify.stop": 600}
-        self.config = with_changes(CONFIG, {**values, **changes})
-        self.rates = rates_over_time(self.config, self.extent)
-        self.density = self._density_from = Mock()
-
-    def step(self):
-        self.iteration += 1
-        self.clock.now += self.second
-
-    def fit(self, seconds):
-        """Iterations until the deadline."""
-        deadline = Deadline(self, self.clock.now + seconds, LINEAR)
-        while deadline.should_continue(self):
-            yield deadline
-            self.step()
-
-
-# Time is proportional to iterations.
-LINEAR = Curve((100, 200), (100.0, 200.0), (20.0, 21.0))
-
-
-@pytest.mark.parametrize("second", [0.05, 0.1, 0.2])
-def test_fit_ends_in_time_for_any_iteration_cost(clock, second):
-    """Planned were 0.1 s. The population changes during six tenths of the iterations.
-
-    An iteration or two more or less: the clock is read between them.
-    """
-    trainer = FakeTrainer(clock, second)
-    for deadline in trainer.fit(100):
-        if trainer.iteration in (0, 10):
-            expected = 100 / second if trainer.iteration else 1000
-            assert deadline.num_iterations(trainer) == expected
-    assert 200 <= clock.now < 200 + 2 * second
-    n = trainer.iteration
-    assert trainer.config.iterations == n == pytest.approx(100 / second, abs=2)
-    assert trainer.config.densify.stop == pytest.approx(0.6 * n, abs=2)
-    # Two iterations of 500 in five e-folds.
-    assert trainer.rates.means(n) == pytest.approx(trainer.rates.means.final, rel=0.02)
-
-
-def test_density_changes_never_end_before_they_start(clock):
-    trainer = FakeTrainer(clock, 1.0, **{"densify.start": 590})
-    list(trainer.fit(100))
-    assert trainer.config.densify.stop == 591
-
-
-def test_plan_of_a_slowing_fit_is_revised(clock):
-    trainer, rates = FakeTrainer(clock, 0.05), []
-    for _ in trainer.fit(100):
-        trainer.second = 0.05 if trainer.iteration < 600 else 0.2
-        rates.append(trainer.rates.means(trainer.iteration + 1))
-    assert trainer.iteration == pytest.approx(600 + 70 / 0.2, abs=2)
-    # All rates, also those of iterations before a revision, are what the last configuration says.
-    assert rates == [trainer.rates.means(i + 1) for i in range(trainer.iteration)]
-    assert len(trainer.config.optimizer.means_lr_aims) == 10
-    # Without revisions after the fit became slower, it would have fallen half the way: 1.7e-5.
-    assert trainer.rates.means.final < rates[-1] < 2 * trainer.rates.means.final
+@pytest.mark.parametrize("is_time_left", [True, False])
+def test_other_ranks_follow_the_clock_of_rank_0(is_time_left):
+    continues = deadline(0.0, SimpleNamespace(broadcast_numbers=lambda own: is_time_left))
+    assert continues(SimpleNamespace(iteration=3)) == is_time_left
 
 
 @pytest.mark.slow
@@ -239,7 +180,7 @@ def test_fit_ends_in_its_budget_and_its_plan_gives_the_same_bytes(tmp_path, monk
     assert seconds == pytest.approx(30, rel=0.1)
     text, config = (out / "plan.txt").read_text(), load_config(out / "config.yml")
     assert text.startswith("--budget 30s\n") and "(chosen)" in text
-    assert f"Planned: {config.optimizer.means_lr_aims[0].end:,} iterations" in text
+    assert f"Planned: {config.iterations:,} iterations" in text
     assert_fits(out / "config.yml", "--out", again)
     name = "point_cloud.ply"
     assert (out / name).read_bytes() == (again / name).read_bytes()
@@ -251,26 +192,3 @@ def test_fit_ends_in_its_budget_and_its_plan_gives_the_same_bytes(tmp_path, monk
         outcome = run_fit(scene, "--out", folder, "--budget", seconds)
         assert outcome.returncode == 2 and message in outcome.stderr
     assert not (tmp_path / "short").exists()
-
-
-def test_plan_revised_after_the_last_checkpoint_can_be_continued(tmp_path, monkeypatch):
-    """Whatever ends the process while the next one is written: one of both plans goes on."""
-    config = FitConfig(data={"path": tmp_path}, iterations=40_000)
-    data = Fingerprint(train=[], test=[])
-    state = Checkpoint({"iteration": np.array(7)}, *History().arrays(), 1.0, data)
-    save_checkpoint(tmp_path, config, state)
-    revised = with_changes(config, {"iterations": config.iterations + 10})
-    for module, name, saved in (
-        (checkpoint.np, "savez", config),
-        (checkpoint, "write_run_config", revised),
-    ):
-        with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-            patched.setattr(module, name, Mock(side_effect=KeyboardInterrupt))
-            save_checkpoint(tmp_path, revised, state)
-        assert load_run_config(tmp_path) == config
-        assert load_checkpoint(tmp_path, config).config == saved
-    save_checkpoint(tmp_path, revised, state)
-    assert load_run_config(tmp_path) == revised
-    moved = with_changes(revised, {"data.path": tmp_path / "moved", "output.history_every": 3})
-    for same in (revised, moved):
-        assert load_checkpoint(tmp_path, same).config == same

@@ -113,8 +113,7 @@ DAMAGE = {
     "fewer filters": (edit("trainer.smoothing/filter", lambda a: a[1:]), "filter must be of shape"),
     "NaN": (spoil("means.value", np.nan), "means.value must hold finite num"),
     "infinite": (spoil("cameras/moves.m", np.inf), "moves.m must hold finite"),
-    "negative iteration": (edit("trainer.iteration", lambda a: -a), "between 0 and 4, got -2"),
-    "late iteration": (edit("trainer.iteration", lambda a: a + 9), "between 0 and 4, got 11"),
+    "negative iteration": (edit("trainer.iteration", lambda a: -a), "must be >= 0, got -2"),
     "several iterations": (edit("trainer.iteration", lambda a: np.array([a, a])), "iteration must"),
     "history of text": (edit("history", lambda a: a.astype("U")), "history must be of shape"),
     "history of 5 columns": (edit("history", lambda a: a[:, :5]), "must be of shape (2, 7)"),
@@ -175,17 +174,16 @@ def saved_as(folder, config, change):
 
     data, state = fingerprint_of(make_dataset(1, 1)), {"iteration": np.array(3)}
     save_checkpoint(folder, config, Checkpoint(state, *History().arrays(), 0.0, data))
-    for name in ("config", "config_before"):
-        edit(name, changed)(folder / "checkpoint.npz")
+    edit("config", changed)(folder / "checkpoint.npz")
 
 
 def remove_new_keys(values):
-    del values["data"]["ignore_points"], values["init"]["start"], values["init"]["scale"]
+    del values["data"]["ignore_points"], values["init"]["start"]
     for name in ("decay", "decay_from", "views", "views_from"):
         del values["optimizer"][name]
     densify = values["densify"]
     kept = ("strategy", "start", "stop", "every", "max_gaussians", "adc")
-    values["densify"] = {name: densify[name] for name in kept}
+    values["densify"] = {name: densify[name] for name in kept if name in densify}
 
 
 def test_checkpoint_of_an_earlier_version_is_continued(tmp_path, config):

@@ -15,8 +15,8 @@ from support.small_fits import (
 )
 
 from drgs.config.approximations import Approximations
-from drgs.fit.live_view import EarlyStop, TrainingViewer
-from drgs.fit.loop import History, StopCriterion, iterations
+from drgs.fit.live_view import TrainingViewer, unless_ended
+from drgs.fit.loop import History, iterations, until_planned_end
 from drgs.integrator.scene import make_scene, render_views
 from drgs.live_page.frames import FRAME_CONTENTS, FrameRequest, ViewerCamera
 from drgs.live_page.scheduler import RenderRequests
@@ -46,14 +46,14 @@ def run(trainer, queue=None, dataset=None, before=lambda _: None, stops=lambda: 
 
     Returns the screen, a mock, and the history. show: what the screen does with an image.
     """
-    screen, length, history = Mock(progress=[]), StopCriterion(), History()
+    screen, length, history = Mock(progress=[]), until_planned_end, History()
     screen.show.side_effect = show
-    screen.show_progress.side_effect = lambda trainer, _, total: screen.progress.append(
-        (trainer.iteration, total)
+    screen.show_progress.side_effect = lambda trainer, _: screen.progress.append(
+        (trainer.iteration, trainer.config.last_iteration)
     )
     if queue is not None:
-        length = EarlyStop(length, queue)
-        watching = TrainingViewer(queue, screen, dataset, length)
+        length = unless_ended(length, queue)
+        watching = TrainingViewer(queue, screen, dataset)
     for done in iterations(trainer, history, length):
         if queue is not None:
             before(done.report.iteration)
@@ -128,7 +128,7 @@ def test_fit_ended_early_equals_a_fit_of_fewer_iterations(end_at):
     )
     done = trainer.iteration
     # The request came when this iteration's end was already decided.
-    assert done == end_at + 1 == trainer.config.iterations
+    assert done == end_at + 1 == trainer.config.last_iteration
     assert history.rows[-1].iteration == done
     assert_told(screen, done, done)
     again = Trainer(trainer.config, dataset, disturbed_blobs())
@@ -170,7 +170,7 @@ def test_ctrl_c_and_ending_early_work_during_a_pause(ends):
     queue.pause(True)
     if ends:
         queue.end()
-        assert EarlyStop(StopCriterion(), queue).should_continue(trainer)  # nothing is fitted yet
+        assert unless_ended(until_planned_end, queue)(trainer)  # nothing is fitted yet
     run(trainer, queue, plain_dataset(), stops=lambda: not ends)
     assert trainer.iteration == (1 if ends else 3)
     queue, trainer = RenderRequests(), make_trainer(plain_dataset(), iterations=3)

@@ -27,6 +27,17 @@ ADC = {
     "densify__adc__reset_every": 9,
 }
 
+PRUNING = {
+    "iterations": 30,
+    "densify__start": 2,
+    "densify__stop": 14,
+    "densify__every": 4,
+    "densify__prune__to": 20,
+    "densify__prune__every": 3,
+    "densify__prune__stop": 24,
+}
+MCMC = {"densify__strategy": "mcmc", "densify__mcmc__gaussians": 60, "densify__mcmc__growth": 0.1}
+
 LATE_STEPS = {
     "iterations": 8,
     "optimizer__views": 3,
@@ -57,6 +68,8 @@ SLOW_FITS = {
     "before a change, smoothing": (plain, {**ADC, **SMOOTHING}, 3, 8),
     "at a change, smoothing": (plain, {**ADC, **SMOOTHING}, 4, 7),
     "after a change, smoothing": (plain, {**ADC, **SMOOTHING}, 5, 6),
+    "growth, then selection": (plain, {**PRUNING, **MCMC}, 5, 22),
+    "selection": (plain, PRUNING, 16, 11),
     **{f"late step, {before}": (plain, LATE_STEPS, before, 5) for before in (4, 5, 6, 7)},
     "cameras, coarse": (plain, {**CAMERAS, **COARSE}, 4, 5),
     # The filter depends on where all cameras are, also on those not seen since.

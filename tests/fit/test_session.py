@@ -1,7 +1,5 @@
 """Fits in memory: ``drgs.train`` and ``FitSession``, and the decisions of rank 0."""
 
-from types import SimpleNamespace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -10,18 +8,16 @@ import yaml
 from support.fit_command import VALUES, write_project
 from support.folders import contents
 from support.small_capture import make_dataset, write_dataset
-from support.trainers import make_trainer
 
 import drgs
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
+from drgs.effects.base import TrainingEffect
 from drgs.fit import __main__ as fit
 from drgs.fit import fit_folder
 from drgs.fit.budget import rehearse
-from drgs.fit.loop import RootDecides, iterations
 from drgs.fit.session import FitSession
 from drgs.training.density.strategy import DensityReport, DensityStrategy
-from drgs.training.effects.base import TrainingEffect
 from drgs.training.losses import Loss
 
 
@@ -42,7 +38,7 @@ class Halves(DensityStrategy):
 
     def refine(self, population, iteration):
         kept = np.arange(population.num_rows // 2)
-        population.edit(population.rows(kept))
+        population.edit(population.to_device_indices(kept))
         return DensityReport(num_gaussians=len(kept))
 
 
@@ -88,36 +84,6 @@ def test_objects_are_used_and_other_trainers_get_copies_of_them(tmp_path):
         assert type(trainer.loss) is Squares and type(trainer.effects[0]) is Blue
         assert trainer.loss is not session.loss and trainer.effects[0] is not effect
     assert effect.count == VALUES["iterations"] < rehearsal.effects[0].count
-
-
-class Revises:
-    """Rank 0 sets another end after the second iteration, and ends there."""
-
-    def should_continue(self, trainer):
-        if trainer.iteration == 2:
-            trainer.reschedule(5, 4)
-        return trainer.iteration < trainer.config.iterations
-
-    def num_iterations(self, trainer):
-        return trainer.config.iterations
-
-
-def test_other_ranks_end_and_revise_a_fit_like_rank_0():
-    told = []
-
-    def ask(numbers):
-        told.append(numbers)
-        return np.array(numbers)
-
-    root = SimpleNamespace(is_root=True, broadcast_numbers=ask)
-    other = SimpleNamespace(is_root=False, broadcast_numbers=lambda numbers: np.array(told.pop(0)))
-    trainers = [make_trainer(iterations=50, densify={"start": 3, "stop": 30}) for _ in range(2)]
-    for trainer, comm in zip(trainers, (root, other), strict=True):
-        criterion = RootDecides(Revises() if comm.is_root else None, comm)
-        history = SimpleNamespace(add=lambda report: None, add_density=lambda *_: None)
-        assert len(list(iterations(trainer, history, criterion))) == 5
-    assert trainers[0].config == trainers[1].config and not told
-    assert trainers[1].config.iterations == 5 and trainers[1].config.densify.stop == 4
 
 
 CONFIG = {

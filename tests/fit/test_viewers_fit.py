@@ -64,8 +64,9 @@ def test_refined_cameras_and_colours_are_kept():
         for name, values in effect.values().items():
             np.testing.assert_array_equal(values, before[effect.name][name])
     config = tuning(trainer.config)
-    assert config.colors.lr == config.colors.vignetting_lr == viewers.NEGLIGIBLE_RATE
-    assert config.cameras.rotation_lr == 0 and len(found.effects) == 3
+    colors = config.sections["colors"]
+    assert colors.lr == colors.vignetting_lr == viewers.NEGLIGIBLE_RATE
+    assert config.sections["cameras"].rotation_lr == 0 and len(found.effects) == 3
 
 
 def test_nonfinite_values_fall_back_to_the_closed_form(monkeypatch):

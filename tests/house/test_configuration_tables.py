@@ -11,7 +11,7 @@ from drgs.config.schema import FitConfig
 nodes = pytest.importorskip("docutils.nodes")
 pytest.importorskip("sphinx")
 
-IN_LISTS = ("coarse.", "densify.stop_aims.", "optimizer.means_lr_aims.")
+IN_LISTS = ("coarse.",)
 
 
 @pytest.fixture(scope="module")

@@ -213,8 +213,8 @@ def test_documents_show_every_command():
 @pytest.mark.parametrize("example", sorted((REPOSITORY / "examples").glob("*.py")))
 def test_documents_contain_the_examples_of_extensions(example):
     program, page = example.read_text(), text_of("docs/developing.md")
-    included = f"```{{literalinclude}} ../examples/{example.name}\n```"
-    assert f"```python\n{program}```" in page or included in page
+    assert f"```{{literalinclude}} ../examples/{example.name}\n```" in page
+    assert f"](../examples/{example.name})" in page
     assert 20 <= len(program.splitlines()) <= 60
 
 

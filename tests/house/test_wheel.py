@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY, copy_checkout, run_program
 from PIL import Image
-from support.small_capture import blobs, make_dataset
+from support.small_capture import blobs, make_dataset, write_dataset
 
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.images import write_png
@@ -59,26 +59,35 @@ def build_wheel(source, folder):
     return wheel
 
 
-def install(wheel, python):
+def install_for(wheel, python):
     """Install a wheel for another interpreter."""
     run(*PIP, "--python", python, "install", *OFFLINE, wheel, cwd=wheel.parent)
 
 
 @pytest.fixture(scope="module")
-def scripts(tmp_path_factory):
-    """Folder of the scripts of a new virtual environment with the wheel in it."""
+def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
-    wheel = build_wheel(copy_checkout(folder / "source"), folder)
+    return build_wheel(copy_checkout(folder / "source"), folder)
+
+
+def make_environment(wheel, folder):
+    """Return the folders of scripts and packages of a new virtual environment with the wheel."""
     run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder)
     scripts = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
     python = scripts / f"python{sysconfig.get_config_var('EXE') or ''}"
-    install(wheel, python)
+    install_for(wheel, python)
     # The dependencies are this environment's, and come last. Its own .pth files, such as that of
     # an editable drgs, are not read there.
     where = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder)
     paths = [path for path in sys.path if path.endswith("site-packages")]
     Path(where.strip(), "dependencies.pth").write_text("\n".join(paths) + "\n")
-    return scripts
+    return scripts, Path(where.strip())
+
+
+@pytest.fixture(scope="module")
+def scripts(wheel, tmp_path_factory):
+    """Folder of the scripts of a new virtual environment with the wheel in it."""
+    return make_environment(wheel, tmp_path_factory.mktemp("environment"))[0]
 
 
 @pytest.fixture
@@ -92,6 +101,29 @@ def test_the_console_script_and_the_module_are_the_same_program(scripts, tmp_pat
     module = run(scripts / "python", "-m", "drgs", "--help", cwd=tmp_path)
     assert script.startswith("usage: drgs [-h]")
     assert script.replace("drgs", "python -m drgs", 1).splitlines()[0] == module.splitlines()[0]
+
+
+def test_a_wheel_without_some_commands_has_the_others(wheel, tmp_path):
+    """Entry points of missing packages are left out."""
+    scripts, packages = make_environment(wheel, tmp_path)
+    for command in ("export", "poses", "capture", "bench", "examine"):
+        shutil.rmtree(packages / "drgs" / command)
+    commands = run(scripts / "drgs", "--help", cwd=tmp_path).partition("commands:")[2]
+    listed = [line.split()[0] for line in commands.partition("examples:")[0].splitlines() if line]
+    assert [name for name in listed if name != "COMMAND"] == ["fit", "render", "view"]
+    write_dataset(tmp_path / "photographs", make_dataset(train=3, test=1))
+    short = ("iterations=4", "init.num_points=60", "output.report=false")
+    short = [word for value in short for word in ("--set", value)]
+    shown = run(scripts / "drgs", "fit", "photographs", *short, "--out", "out", cwd=tmp_path)
+    assert "not examined: no examiner is installed" in shown and "written: " in shown
+    run(scripts / "drgs", "render", "out", "--orbit", 2, "--out", "images", cwd=tmp_path)
+    assert len(list((tmp_path / "images").glob("**/*.png"))) == 2
+    assert "usage: drgs view" in run(scripts / "drgs", "view", "--help", cwd=tmp_path)
+    shutil.copy(tmp_path / "out" / "point_cloud.ply", tmp_path / "model.ply")
+    (tmp_path / "scene.xml").write_text(SCENE)
+    program = "import drgs, mitsuba as mi; mi.set_variant('llvm_ad_rgb')\n"
+    program += "print(mi.render(mi.load_file('scene.xml')).shape)"
+    assert run(scripts / "python", "-c", program, cwd=tmp_path).startswith("(24, 32, ")
 
 
 def test_the_script_renders_gaussians_and_a_mitsuba_scene(scripts, model, tmp_path):
@@ -127,14 +159,12 @@ data: {path: photographs, type: numpy_poses, test_every: 4}
 iterations: 12
 init: {num_points: 60, half_extent: 0.5}
 model: {falloff: compact}
-densify: {strategy: halving}
+densify: {strategy: halving, halving: {after: 8}}
 loss: {type: charbonnier}
 output: {report: false}
-extensions:
-  numpy_poses: {unit: 1.0}
-  halving: {after: 8}
-  vignetting: {lr: 0.02}
-  binary_opacity: {weight: 0.1}
+numpy_poses: {unit: 1.0}
+vignetting: {lr: 0.02}
+binary_opacity: {weight: 0.1}
 """
 
 PROGRAM = """
@@ -142,6 +172,7 @@ import drgs
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 from drgs.config.load import load_config
+from drgs.config.schema import FitConfig
 from charbonnier import Charbonnier, CharbonnierSection
 from halving import Halving, HalvingSection
 from vignetting import Vignetting, VignettingSection
@@ -149,9 +180,7 @@ from vignetting import Vignetting, VignettingSection
 # The rates' decay follows from the strategy's name: here it is that of ``halving``.
 settings = ["densify.strategy=budget", "loss.type=photometric", "optimizer.decay=0.1"]
 config = load_config("fit.yml", settings)
-config = config.model_copy(update={"extensions": {
-    name: section for name, section in config.extensions.items() if name != "vignetting"
-}})
+config = FitConfig.model_validate(config.model_dump(exclude={"vignetting"}))
 result = drgs.train(
     config,
     strategy=Halving(HalvingSection(after=8)),
@@ -192,7 +221,7 @@ def test_external_package_can_use_every_extension_point(scripts, photographs):
     """A strategy, effect, loss, term, lens, falloff, file format and reader; no file of drgs."""
     folder = photographs
     source = shutil.copytree(REPOSITORY / "examples", folder / "source")
-    install(build_wheel(source, folder), scripts / "python")
+    install_for(build_wheel(source, folder), scripts / "python")
     shutil.rmtree(source)
     (folder / "fit.yml").write_text(CONFIGURATION)
     shown = run(scripts / "drgs", "fit", "fit.yml", "--out", "out", cwd=folder)
@@ -209,6 +238,8 @@ def test_external_package_can_use_every_extension_point(scripts, photographs):
     short = ("--set", "iterations=4", "--set", "init.num_points=60", "--set", "output.report=false")
     shown = run(scripts / "drgs", "fit", "bent", *short, "--out", "bent_out", cwd=folder)
     assert "unified" in shown and "unified" in (folder / "bent_out" / "views.json").read_text()
+    assert "count     print the number of Gaussians" in run(scripts / "drgs", "--help", cwd=folder)
+    assert run(scripts / "drgs", "count", "yaml.npz", cwd=folder) == "30\n"
     help_text = " ".join(run(scripts / "drgs", "fit", "--help", cwd=folder).split())
     for name in (
         "dataset reader numpy_poses",

@@ -40,12 +40,12 @@ def test_fit_with_alpha_images_starts_on_the_visual_hull():
     assert 200 < len(start.means) <= 300
     assert np.abs(np.linalg.norm(start.means, axis=1) - 0.8).max() < 0.25
     assert np.abs(start.colors - colors_at(start.means)).mean() < 0.05
-    g = initial_gaussians(config(opacity=0.3, scale=0.5), BALL)
+    g = initial_gaussians(config(opacity=0.3), BALL)
     np.testing.assert_array_equal(g.means, start.means)
     np.testing.assert_allclose(0.5 + SH_C0 * g.sh0[:, 0], start.colors, atol=1e-6)
     np.testing.assert_allclose(g.opacities, 0.3, rtol=1e-6)
     nearest = mean_squared_neighbour_distance(g.means.astype(float))
-    np.testing.assert_allclose(g.scales[:, 0], 0.5 * np.sqrt(nearest), rtol=1e-4)
+    np.testing.assert_allclose(g.scales[:, 0], np.sqrt(nearest), rtol=1e-4)
 
 
 EMPTY = with_alpha(np.zeros_like)

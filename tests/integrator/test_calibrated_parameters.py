@@ -76,7 +76,7 @@ def test_missing_coefficients_are_not_exposed():
 
 
 LENS_NAMES = (
-    "there are pinhole, opencv, fisheye, thin_prism_fisheye, equirectangular (others come with "
+    "there are equirectangular, fisheye, opencv, pinhole, thin_prism_fisheye (others come with "
     'installed packages that have an entry point of the group "drgs")'
 )
 

@@ -131,7 +131,7 @@ REFUSED = [
     ({"order_window": 3.5}, "order_window must be from 1 to 64, got 3.5"),
     (
         {"projection": "affine"},
-        "projection must be one of ewa, unscented, exact (others come with installed "
+        "projection must be one of ewa, exact, unscented (others come with installed "
         "packages that have an entry point of the group \"drgs\"), got 'affine'",
     ),
     ({"low_pass": -1}, "low_pass must be finite and not negative, got -1.0"),

@@ -17,10 +17,10 @@ from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.viewpoints import CameraMotion
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
+from drgs.effects.base import integrator_settings, training_effects
 from drgs.fit.summary import summary_of_fit
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import format_effects, summary_of_sensors, summary_of_views
-from drgs.training.effects.base import integrator_settings, training_effects
 
 MODULES = (
     "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
@@ -30,11 +30,8 @@ MODULES = (
     "integrator.light.splat_transport", "integrator.light.shadows",
     "integrator.light.surfaces",
     "light", "light.grid", "light.probe", "light.walk",
-    "training.effects.background", "training.effects.cameras", "training.effects.colors",
-    "training.effects.depth", "training.effects.masks", "training.effects.photometry",
-    "training.effects.smoothing", "training.effects.view_parameters",
 )  # fmt: skip
-"""Modules used only by effects."""
+"""Modules used only by effects of images; a fit asks every effect whether it takes part."""
 
 
 def config_of(**changes):
@@ -50,8 +47,8 @@ def test_the_plan_of_a_plain_fit():
         "simulated:\n"
         "  view dependence: spherical harmonics up to degree 3 (model.sh_degree: 3)\n"
         "  background: white (data.background)\n"
-        "  not simulated: lens distortion, motion, antialiasing, exposure and white balance, "
-        "masks, depth, camera refinement"
+        "  not simulated: lens distortion, motion, antialiasing, depth, exposure and white "
+        "balance, masks, camera refinement"
     )
     default = FitConfig(data={"path": ".", "background": "white"})
     by_default = format_effects(summary_of_fit(default, fits.plain_dataset()))
@@ -88,10 +85,10 @@ def test_plan_of_a_fit_lists_the_setting_of_each_effect():
         "  motion: rolling shutter (1 of the dataset's cameras)\n"
         "  antialiasing: opacities compensated for the low-pass filter, 3D smoothing filter "
         "(model.antialiased, model.smoothing)\n"
+        "  depth: supervision (the dataset's depth, in 6 views)\n"
         "  exposure and white balance: a colour transform for each training photograph "
         "(colors.lr)\n"
         "  masks: pixels left out (the dataset's masks, in 2 views)\n"
-        "  depth: supervision (the dataset's depth, in 6 views)\n"
         "  camera refinement: poses, focal lengths (cameras.optimise)\n"
         "  not simulated: view dependence"
     )
@@ -124,8 +121,8 @@ def test_plan_of_a_fit_lists_ignored_data():
     """Not what is ignored and not there."""
     ignored = replace(fits.plain_dataset(), ignored=("distortion", "motion", "masks", "depth"))
     assert format_effects(summary_of_fit(config_of(), ignored)).splitlines()[-1] == (
-        "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, exposure and "
-        "white balance, masks (ignored), depth (ignored), camera refinement"
+        "  not simulated: lens distortion (ignored), motion (ignored), antialiasing, "
+        "depth (ignored), exposure and white balance, masks (ignored), camera refinement"
     )
     plain = config_of(
         loss__depth_weight=0.0, data__ignore_distortion=True, data__ignore_motion=True
@@ -234,37 +231,13 @@ import json, sys
 sys.path.insert(0, {tests!r})
 import drgs, mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_rgb")
-from dataclasses import replace
-from drgs.training.effects.base import training_effects
-from drgs.fit.summary import summary_of_fit
 from support import small_capture as capture
 from support.trainers import make_trainer
-from support.viewer_rendering import VIEWER_RENDERING
-from drgs.config.changes import with_changes
-from drgs.config.schema import FitConfig
-
-plain = capture.make_dataset(2, 1)
-ones = np.ones((capture.HEIGHT, capture.WIDTH), np.float32)
-
-def dataset(**extras):
-    return replace(plain, train=tuple(replace(view, **extras) for view in plain.train))
 
 make_trainer().step()
-found, known = {{"a plain fit": sorted(set(sys.modules) & set({modules!r}))}}, set()
-for name, extras, changes in (
-    ("nothing", {{}}, {{}}),
-    ("smoothing", {{}}, {{"model.smoothing": True}}),
-    ("masks", {{"mask": ones}}, {{}}),
-    ("colors", {{}}, {{"colors.lr": 0.1}}),
-    ("photometry", {{}}, {{"colors.vignetting_lr": 0.1}}),
-    ("cameras", {{}}, {{"cameras.optimise": True}}),
-):
-    config = with_changes(FitConfig(data={{"path": "."}}), changes)
-    summary_of_fit(config, dataset(**extras))
-    training_effects(config, dataset(**extras))
-    now = set(sys.modules) & set({modules!r})
-    found[name] = sorted(now - known)
-    known |= now
+now = set(sys.modules) & set({modules!r})
+found = {{"a plain fit": sorted(now - set({asked!r}))}}
+known = now | set({asked!r})
 
 def sensor(**settings):
     film = {{"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {{"type": "box"}}}}
@@ -302,18 +275,15 @@ print(json.dumps(found))
 def test_each_effect_imports_its_own_modules(run_python, tmp_path):
     """In this order, what comes later knows what came before."""
     program = IMPORTS.format(
-        tests=TESTS, modules=[f"drgs.{name}" for name in MODULES], ply=str(tmp_path / "blobs.ply")
+        tests=TESTS,
+        modules=[f"drgs.{name}" for name in MODULES],
+        asked=["drgs.effects.smoothing", "drgs.cameras.motion"],  # by a fit
+        ply=str(tmp_path / "blobs.ply"),
     )
     result = run_python(program)
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout) == {
         "a plain fit": [],
-        "nothing": [],
-        "smoothing": ["drgs.effects.smoothing", "drgs.training.effects.smoothing"],
-        "masks": ["drgs.training.effects.masks"],
-        "colors": ["drgs.training.effects.colors", "drgs.training.effects.view_parameters"],
-        "photometry": ["drgs.training.effects.photometry"],
-        "cameras": ["drgs.cameras.motion", "drgs.training.effects.cameras"],
         "calibrated": [],
         "perspective": [],
         "light without surfaces": [],

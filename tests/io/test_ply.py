@@ -411,7 +411,7 @@ def test_contradictory_values_are_refused(tmp_path):
         ("order_window", "9" * 40, f"from 1 to 64, got {'9' * 40}"),
         ("order_window", "4.0", "from 1 to 64, got 4.0"),
         ("antialiased", "1", "true or false, got 1"),
-        ("projection", "fish", "one of ewa, unscented, exact (others come with installed packages"),
+        ("projection", "fish", "one of ewa, exact, unscented (others come with installed packages"),
         ("alpha_max", "0.99999999999", "above 0 and below 1 in float32, got 0.99999999999"),
     ],
 )

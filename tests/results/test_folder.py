@@ -8,11 +8,12 @@ from conftest import REPOSITORY
 from support.folders import contents
 
 from drgs.config.changes import is_open, with_changes
+from drgs.config.extensions import EFFECTS
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.results import files
-from drgs.results.files import METRICS, RESULTS
+from drgs.results.files import METRICS, result_names
 from drgs.results.folder import (
     FOLDERS,
     check_output_folder,
@@ -95,10 +96,10 @@ def test_temporary_files_of_a_killed_run_are_removed(finished, config):
 
 
 def test_other_runs_and_foreign_files_are_refused_and_kept(tmp_path, finished, config):
-    changes = {"init": {"half_extent": 2.0}, "densify": {"every": 9}, "loss": {"sigma": 2.0}}
+    changes = {"init": {"half_extent": 2.0}, "densify": {"every": 9}, "loss": {"dssim_weight": 0.5}}
     message = (
         "already holds another run, which differs in init.half_extent = None (here 2.0), "
-        "loss.sigma = 1.5 (here 2.0), densify.every = 100 (here 9) and 1 more; choose"
+        "loss.dssim_weight = 0.2 (here 0.5), densify.every = 100 (here 9) and 1 more; choose"
     )
     other = FitConfig(data=config.data, seed=7, **changes)
     assert_refused(message, claim_output_folder, finished, other)
@@ -136,7 +137,7 @@ def test_removing_a_run_deletes_every_result(tmp_path, config):
     remove_run(tmp_path / "none")
     remove_run(tmp_path)
     claim_output_folder(tmp_path, config)
-    for name in RESULTS:
+    for name in result_names():
         if name in FOLDERS:
             (tmp_path / name / "empty").mkdir(parents=True)
         else:
@@ -154,9 +155,11 @@ def test_folder_in_place_of_a_result_is_not_removed(finished, is_recorded):
     assert (finished / "curves.png").is_dir()
 
 
-ALLOWED_NAMES = {"fit.py": {files.TENSORBOARD}, "results/files.py": {files.CONFIG, *RESULTS}}
-"""Modules below ``results`` recognise a fit's folder by names that they write out themselves; the
-extra that a command asks for has the name of a folder."""
+EFFECT_NAMES = {f"effects/{e.name}.py": set(e.value.files) for e in EFFECTS.all()}
+
+OTHER_NAMES = {files.CONFIG, *result_names()} - set().union(*EFFECT_NAMES.values())
+
+ALLOWED_NAMES = {"results/files.py": OTHER_NAMES, **EFFECT_NAMES}
 
 
 @pytest.mark.slow
@@ -166,4 +169,4 @@ def test_file_names_are_written_in_one_module_only():
         nodes = ast.walk(ast.parse(path.read_text()))
         strings = {node.value for node in nodes if isinstance(node, ast.Constant)} - {None}
         module = path.relative_to(REPOSITORY / "drgs").as_posix()
-        assert {files.CONFIG, *RESULTS} & strings == ALLOWED_NAMES.get(module, set()), module
+        assert {files.CONFIG, *result_names()} & strings == ALLOWED_NAMES.get(module, set()), module

@@ -19,10 +19,11 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 @contextmanager
 def installed_examples(*names: str) -> Iterator[dict[str, ModuleType]]:
     """Within the block, entry points name these modules of ``examples``; yields the modules."""
-    points = [EntryPoint(name, name, registry.ENTRY_POINT_GROUP) for name in names]
+    points = [EntryPoint(name, name, registry.ANY_KIND) for name in names]
+    find = lambda group: [point for point in points if point.group == group]  # noqa: E731
     with (
         mock.patch.object(sys, "path", [str(EXAMPLES), *sys.path]),
-        mock.patch.object(registry, "entry_points", lambda group: points),
+        mock.patch.object(registry, "entry_points", find),
         mock.patch.dict(sys.modules),
         registry.temporary_registrations(),
     ):

@@ -4,8 +4,9 @@ import drjit as dr
 import numpy as np
 from drjit.llvm.ad import TensorXf
 
+from drgs.core.adam import make_optimizer
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.training.optimizer import Population, make_optimizer
+from drgs.training.optimizer import Population
 
 EXTENT = 4.0
 

@@ -14,11 +14,11 @@ from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.datasets.images import compact_photograph
 from drgs.datasets.types import Dataset, View
+from drgs.effects.base import TrainingEffect
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.images import to_uint8
 from drgs.results.metrics import ssim
-from drgs.training.effects.base import TrainingEffect
 from drgs.training.trainer import Trainer
 from support import small_capture as capture
 from support.small_capture import WHITE, double, photograph
@@ -146,10 +146,12 @@ def config_of(**changes) -> FitConfig:
     return with_changes(config, changes)
 
 
-def make_trainer(dataset: Dataset, gaussians: Gaussians | None = None, **changes) -> Trainer:
+def make_trainer(
+    dataset: Dataset, gaussians: Gaussians | None = None, room: int = 2 << 30, **changes
+) -> Trainer:
     """See :func:`config_of`; ``__`` is written for the dot."""
     values = {key.replace("__", "."): value for key, value in changes.items()}
-    return Trainer(config_of(**values), dataset, gaussians or disturbed_blobs())
+    return Trainer(config_of(**values), dataset, gaussians or disturbed_blobs(), room=room)
 
 
 def with_numbers(trainer: Trainer, **values) -> Trainer:

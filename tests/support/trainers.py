@@ -21,11 +21,11 @@ def small_dataset():
     return Dataset(views, views[:1], "test", (1.0, 1.0, 1.0), 1.0, "four random images")
 
 
-def make_trainer(**changes):
+def make_trainer(room=2 << 30, **changes):
     from drgs.training.trainer import Trainer
 
     config = FitConfig.model_validate({"data": {"path": "."}, "iterations": 50, **changes})
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3))
     half_opaque = with_changes(config, {"init.opacity": 0.5})
     gaussians = gaussians_at(Start(points, None, "random"), half_opaque)
-    return Trainer(config, small_dataset(), gaussians)
+    return Trainer(config, small_dataset(), gaussians, room=room)

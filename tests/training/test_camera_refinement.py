@@ -20,10 +20,9 @@ from drgs.cameras.viewpoints import CameraMotion
 from drgs.core.errors import UserError
 from drgs.datasets.camera_file import read_viewpoints
 from drgs.datasets.images import smaller_view
+from drgs.effects.cameras import CAMERAS, INTRINSICS
 from drgs.integrator.scene import render_views
-from drgs.results.files import CAMERAS
 from drgs.results.refined_cameras import refined_dataset
-from drgs.training.effects.cameras import INTRINSICS
 
 
 def make_trainer(dataset=None, gaussians=None, **changes):

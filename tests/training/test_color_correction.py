@@ -10,8 +10,8 @@ from support import small_fits as fits
 from support.helpers import central_difference, single
 from support.small_fits import photometric_loss
 
+from drgs.effects.colors import COLORS
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.results.files import COLORS
 
 IDENTITY = np.eye(3, 4)
 

@@ -11,10 +11,10 @@ from drgs.cli.commands import CommandParser
 from drgs.config.changes import with_changes
 from drgs.config.load import config_from, dump_config, load_config
 from drgs.core.errors import UserError
+from drgs.effects.base import training_effects
 from drgs.fit.__main__ import add_arguments
 from drgs.fit.summary import summary_of_fit
 from drgs.integrator.summary import format_effects
-from drgs.training.effects.base import training_effects
 from drgs.training.losses import prepare_target
 
 
@@ -27,33 +27,37 @@ def examples():
 def configured(**changes):
     """The configuration of a small fit with the examples, from nested mappings."""
     values = fits.config_of().model_dump()
-    values["densify"] = {"strategy": "halving", "remove_floaters": False}
+    values["densify"] = {"strategy": "halving", "halving": {"after": 6}, "remove_floaters": False}
     values["loss"] = {"type": "charbonnier"}
-    values["extensions"] = {
-        "halving": {"after": 6},
-        "vignetting": {},
-        "binary_opacity": {"weight": 0.5},
-        **changes,
-    }
+    values |= {"vignetting": {}, "binary_opacity": {"weight": 0.5}, **changes}
     values["iterations"], values["init"] = 12, {"num_points": 40}
     return config_from(values, "x.yml")
 
 
 def test_a_configuration_names_extensions_and_sets_their_sections(tmp_path):
     config = configured()
-    assert config.extensions["halving"].after == 6
-    assert config.extensions["vignetting"].lr == 0.01
+    assert config.densify.sections["halving"].after == 6
+    assert config.sections["vignetting"].lr == 0.01
     dump_config(config, tmp_path / "config.yml")
-    again = load_config(tmp_path / "config.yml", ["extensions.binary_opacity.weight=2.5"])
-    assert with_changes(again, {"extensions": {}}) == with_changes(config, {"extensions": {}})
-    assert again.extensions["binary_opacity"].weight == 2.5
-    assert type(again.extensions["halving"]) is type(config.extensions["halving"])
+    again = load_config(tmp_path / "config.yml", ["binary_opacity.weight=2.5"])
+    assert with_changes(again, {"binary_opacity.weight": 0.5}) == config
+    assert type(again.densify.sections["halving"]) is type(config.densify.sections["halving"])
+
+
+def test_sections_of_earlier_versions_are_read():
+    old = {"data": {"path": "."}, "densify": {"strategy": "halving"}}
+    old["extensions"] = {"halving": {"after": 6}, "vignetting": None}
+    config = config_from(
+        old, "x.yml", ["extensions.vignetting.lr=0.5", "extensions.halving.after=7"]
+    )
+    assert config.densify.sections["halving"].after == 7
+    assert config.sections["vignetting"].lr == 0.5 and "extensions" not in config.model_dump()
 
 
 REFUSED = [
-    ({"extensions": {"halvin": {}}}, "extensions.halvin: no extension has this name; did you"),
-    ({"extensions": {"halving": {"after": 0}}}, "extensions.halving.after must be >= 1, got 0"),
-    ({"extensions": {"halving": {"aftr": 3}}}, "unknown key extensions.halving.aftr; did you mean"),
+    ({"extensions": {"halvin": {}}}, "unknown key halvin; did you mean densify.halving?"),
+    ({"densify": {"halving": {"after": 0}}}, "densify.halving.after must be >= 1, got 0"),
+    ({"densify": {"halving": {"aftr": 3}}}, "unknown key densify.halving.aftr; did you mean"),
     (
         {"densify": {"strategy": "halvin"}},
         "densify.strategy must be one of 'adc', 'budget', 'mcmc', 'halving'; did you mean halving",
@@ -112,7 +116,6 @@ def test_loss_and_its_term_match_numpy(examples):
 
 
 def test_effect_applies_depending_on_the_dataset(examples, monkeypatch):
-    """Return whether its section is present."""
     needs = lambda config, dataset: any(view.depth is not None for view in dataset.train)  # noqa: E731
     monkeypatch.setattr(examples["vignetting"].Vignetting, "is_used", needs)
     for dataset, used in ((fits.plain_dataset(), []), (fits.true_dataset(), ["vignetting"])):
@@ -130,7 +133,7 @@ def test_errors_of_an_extension_are_reported_with_its_name(examples, monkeypatch
 
 def test_summary_and_help_list_extensions():
     text = format_effects(summary_of_fit(configured(), fits.plain_dataset()))
-    assert "vignetting: effect: Renderings are darkened" in text and "extensions.vignetting" in text
+    assert "vignetting: effect: Renderings are darkened" in text and "(vignetting)" in text
     assert "halving: density strategy: Keeps the more" in text
     assert "(densify.strategy: halving)" in text
     parser = CommandParser(prog="drgs fit")

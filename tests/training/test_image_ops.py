@@ -17,7 +17,7 @@ from support.helpers import (
 )
 from support.kernels import float_reductions
 
-from drgs.training.effects import colors, depth
+from drgs.effects import colors, depth
 
 HEIGHT, WIDTH = 13, 21
 

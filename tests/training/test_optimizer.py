@@ -7,9 +7,9 @@ from drjit.llvm.ad import Float, TensorXf, UInt32
 from drjit.opt import Adam
 from support.populations import rows_of
 
+from drgs.core import adam
+from drgs.core.adam import LARGE_WIDTH, make_optimizer
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.training import optimizer as optimizer_module
-from drgs.training.optimizer import LARGE_WIDTH, make_optimizer
 
 RATES = {name: 0.01 * (k + 1) for k, name in enumerate(PARAMETER_NAMES)}
 
@@ -85,7 +85,7 @@ def test_moments_that_are_overwritten_are_those_that_are_not(monkeypatch):
     num, key = 25_000, "shN"
     results = []
     for large in (LARGE_WIDTH, 1 << 40):
-        monkeypatch.setattr(optimizer_module, "LARGE_WIDTH", large)
+        monkeypatch.setattr(adam, "LARGE_WIDTH", large)
         optimizer = make_optimizer(parameters(num), RATES)
         step(optimizer, 0, np.arange(num) % 100)
         rows_of(optimizer).edit(dr.arange(UInt32, num) ^ 1, parameters(7))

@@ -21,8 +21,7 @@ from drgs.core.errors import UserError
 from drgs.datasets import images, storage
 from drgs.datasets.storage import DiskStore, is_on_disk
 from drgs.fit import memory
-from drgs.training.read_ahead import NUM_AHEAD
-from drgs.training.steps import view_of
+from drgs.training.steps import NUM_AHEAD, view_of
 from drgs.training.trainer import Trainer
 
 PLANES = ("image", "alpha", "mask", "depth")
@@ -231,11 +230,10 @@ def test_refused_before_the_fit(tmp_path, monkeypatch, prepare, data, place, rem
 
 def test_a_fit_that_is_refused_for_its_photographs_can_have_them_on_disk(tmp_path, monkeypatch):
     dataset = load(write_photographs(tmp_path / "data"), in_memory=True)
-    config, start = Mock(), Mock(num_gaussians=10)
-    needed = memory.FitMemory(0, 10**9, 0, 5 * 10**8, 0, 0)
+    config, needed = Mock(), memory.FitMemory(10**9, 5 * 10**8, 0)
     monkeypatch.setattr(memory, "estimate", lambda *_, **__: needed)
     monkeypatch.setattr(memory, "max_num_gaussians", lambda *_: 10)
-    refused = memory._refusal(config, dataset, start, needed, 10**9, 1)
+    refused = memory._refusal(config, dataset, 10, needed, 10**9, 1)
     assert "available memory; set data.in_memory=false" in refused
     on_disk = load(tmp_path / "data", in_memory=False)
-    assert "in_memory" not in memory._refusal(config, on_disk, start, needed, 10**9, 1)
+    assert "in_memory" not in memory._refusal(config, on_disk, 10, needed, 10**9, 1)

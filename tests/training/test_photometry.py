@@ -12,10 +12,10 @@ from support import small_fits as fits
 from support.helpers import central_difference, single
 from support.small_fits import photometric_loss
 
-from drgs.config.schema import ColorConfig
 from drgs.core.errors import UserError
+from drgs.effects.colors import ColorConfig
+from drgs.effects.photometry import PHOTOMETRY
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.results.files import PHOTOMETRY
 
 VIGNETTING = np.array([[-0.3, 0.1, -0.15], [0.05, -0.1, 0.02]])
 RESPONSE = np.array([[0.2, 0.1], [-0.2, -0.1]])  # their mean is zero

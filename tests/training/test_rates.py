@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from support.trainers import make_trainer
 
 from drgs.config.schema import FitConfig
 from drgs.training.rates import ExponentialDecay, rates_over_time
@@ -35,26 +34,9 @@ def test_rates_but_that_of_means_are_constant_without_a_decay():
     assert rates(1) | {"means": 0} == rates(50) | {"means": 0}
 
 
-def test_revised_plan_keeps_past_rates():
-    changes = {"optimizer": {"decay": 0.1, "decay_from": 0.2}, "densify": {"start": 1, "stop": 2}}
-    trainer = make_trainer(**changes)
-    trainer.iteration, before = 30, trainer.rates
-    trainer.reschedule(40, 2)
-    after = rates_over_time(trainer.config, trainer.extent)
-    for iteration in range(1, 31):
-        assert after(iteration) == pytest.approx(before(iteration), rel=1e-12)
-    assert trainer.rates(40)["sh0"] == pytest.approx(0.1 * trainer.config.optimizer.sh0_lr)
-    trainer.iteration = 45
-    with pytest.raises(ValueError, match="cannot change from 2 to 44 after iteration 45"):
-        trainer.reschedule(50, 44)
-
-
-def test_a_decay_that_is_revised_spreads_what_is_left():
-    """Half of it is done at 50; a quarter is left in the middle of what remains; none at 150."""
-    rate = ExponentialDecay(1.0, 1e-4, ((0, 100), (50, 150)))
-    once = ExponentialDecay(1.0, 1e-4, ((0, 100),))
-    assert [rate(i) for i in range(51)] == [once(i) for i in range(51)]
-    exponents = [math.log10(rate(i)) for i in (50, 75, 100, 150, 200)]
-    np.testing.assert_allclose(exponents, [-2, -2.5, -3, -4, -4], rtol=1e-12)
+def test_decay_is_exponential_from_its_start_to_its_end():
+    rate = ExponentialDecay(1.0, 1e-4, 50, 150)
+    exponents = [math.log10(rate(i)) for i in (0, 50, 75, 100, 150, 200)]
+    np.testing.assert_allclose(exponents, [0, 0, -1, -2, -4, -4], rtol=1e-12)
     with pytest.raises(ValueError, match="must be > 0"):
-        ExponentialDecay(1e-3, 0.0, ((0, 10),))
+        ExponentialDecay(1e-3, 0.0, 0, 10)

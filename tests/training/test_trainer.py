@@ -10,7 +10,6 @@ from support.kernels import kernel_hashes
 from support.small_fits import steps
 from support.trainers import make_trainer
 
-from drgs.training import steps as steps_module
 from drgs.training.losses import TARGET_BYTES
 from drgs.training.steps import bytes_per_pixel
 
@@ -74,16 +73,15 @@ def test_population_may_change_without_higher_degrees():
 
 
 def indices_on_device(trainer):
-    """Indices of the views whose targets are on the device, by stage."""
+    """Indices of the views whose targets are on the device, by phase."""
     return [
-        {view.index for view in stage.views if "photograph" in vars(view)}
-        for stage in trainer.stages
+        {view.index for view in phase.views if "photograph" in vars(view)}
+        for phase in trainer.phases
     ]
 
 
-def test_targets_are_cached_within_the_memory_limit(monkeypatch):
-    monkeypatch.setattr(steps_module, "MAX_TARGET_BYTES", 2 * 20 * 16 * TARGET_BYTES + 7)
-    trainer, seen = make_trainer(), []
+def test_targets_are_cached_within_the_memory_limit():
+    trainer, seen = make_trainer(room=2 * 20 * 16 * TARGET_BYTES + 7), []
     assert indices_on_device(trainer) == [set()]
     for _ in range(8):  # two rounds of four views
         trainer.step()
@@ -93,16 +91,16 @@ def test_targets_are_cached_within_the_memory_limit(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("effects", [{}, {"data__random_background": True, "colors__lr": 0.02}])
-def test_fit_does_not_depend_on_cached_targets(monkeypatch, effects):
+def test_fit_does_not_depend_on_cached_targets(effects):
     """Nor on effects that upload something of a view."""
 
-    def result():
-        trainer = fits.make_trainer(fits.true_dataset(), loss__depth_weight=0.2, **effects)
+    def result(**room):
+        settings = {"loss__depth_weight": 0.2, **effects, **room}
+        trainer = fits.make_trainer(fits.true_dataset(), **settings)
         return trainer, fits.everything_of(steps(trainer, 8))
 
     _, kept = result()
-    monkeypatch.setattr(steps_module, "MAX_TARGET_BYTES", 0)
-    trainer, made_again = result()
+    trainer, made_again = result(room=0)
     assert indices_on_device(trainer) == [set()]
     assert not any(view.uploads for view in trainer.views)
     assert made_again == kept

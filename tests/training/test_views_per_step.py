@@ -108,7 +108,7 @@ def test_image_size_changes_with_the_first_step_after_a_stage():
     whole = fits.plain_dataset().train[0].width
     widths = [step.views[-1].view.width for step in steps]
     assert widths == [whole // 2, whole // 2, whole, whole]
-    assert [step.begins_stage for step in steps] == [False, False, True, False]
+    assert [step.begins_phase for step in steps] == [False, False, True, False]
 
 
 def test_density_change_due_within_a_step_follows_the_step():

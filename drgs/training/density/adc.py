@@ -9,16 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import cast
+from typing import ClassVar, cast
 
 import drjit as dr
 import numpy as np
+from pydantic import Field
 from scipy.special import expit
 from typing_extensions import override
 
-from drgs.config.density import SCHEDULES
+from drgs.config.density import REFERENCE_STOP
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import DensifyConfig, FitConfig
+from drgs.config.section import Count, Section
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
 from drgs.core.types import Array2f, Float
@@ -33,25 +35,72 @@ from drgs.training.density.strategy import (
 )
 
 
-@STRATEGIES.register("adc")
+class AdcConfig(Section):
+    """The strategy ``adc``, adaptive density control: clone, split, prune, opacity reset."""
+
+    scaled: ClassVar = ("reset_every", "white_background_reset")
+
+    grad_threshold: float = Field(
+        2e-4,
+        gt=0,
+        description="Clone or split a Gaussian whose 2D position gradient has at least this mean "
+        "norm, in NDC units, over the views that it is visible in.",
+    )
+    clone_scale: float = Field(
+        0.01,
+        gt=0,
+        description="Clone up to this largest scale, split above it; in scene extents.",
+    )
+    split_count: int = Field(
+        2, ge=2, le=1_000_000, description="Number of samples that replace a split Gaussian."
+    )
+    split_shrink: float = Field(1.6, gt=1, description="Divisor of the samples' scales.")
+    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Remove less opaque Gaussians.")
+    prune_scale: float = Field(
+        0.1,
+        gt=0,
+        description="Remove Gaussians of a larger scale after the first reset; in scene extents.",
+    )
+    reset_every: Count = Field(
+        3000, ge=1, description="Iterations between opacity resets, up to densify.stop."
+    )
+    reset_opacity: float = Field(0.01, gt=0, lt=1, description="Maximum opacity after a reset.")
+    white_background_reset: Count | None = Field(
+        500, ge=1, description="Iteration of an extra reset if the background is white; null: none."
+    )
+
+    @override
+    def check(self, config: FitConfig) -> None:
+        """Refuse resets that remove everything."""
+        if self.prune_opacity >= self.reset_opacity:
+            raise ValueError(
+                "densify.adc.prune_opacity must be < densify.adc.reset_opacity "
+                f"({self.reset_opacity}), or a reset removes everything, got {self.prune_opacity}"
+            )
+
+
+@STRATEGIES.register("adc", section=AdcConfig)
 @dataclass
 class AdaptiveDensityControl(DensityStrategy):
     """Clones and splits where gradients are large, prunes transparent and large Gaussians."""
 
     config: DensifyConfig
+    settings: AdcConfig
     white_background: bool = False
     gradient_norms: Float = NOT_BEGUN  # (N,): sum over views of |d loss / d mean2d| in NDC units
     views: Float = NOT_BEGUN  # (N,): number of views in which the Gaussian was visible
     by_row = ("gradient_norms", "views")
-    start_share, stop_share, rate_decay = SCHEDULES["adc"]
+    # Of 7,000 iterations, 2,000 are left for the last opacities to settle.
+    start_share, stop_share, latest_stop, rate_decay = 1 / 2, 5 / 7, REFERENCE_STOP, 1.0
+    begins_coarse = False
 
     @classmethod
     @override
     def from_config(
-        cls, config: FitConfig, dataset: Dataset | None, section: None
+        cls, config: FitConfig, dataset: Dataset | None, section: AdcConfig
     ) -> AdaptiveDensityControl:
         is_white = dataset is not None and tuple(dataset.background) == (1.0, 1.0, 1.0)
-        return cls(config.densify, is_white)
+        return cls(config.densify, section, is_white)
 
     @override
     def begin(self, population: Population) -> None:
@@ -92,7 +141,7 @@ class AdaptiveDensityControl(DensityStrategy):
 
         White backgrounds get one more: white Gaussians in front of white would otherwise stay.
         """
-        adc = self.config.adc
+        adc = self.settings
         is_extra = self.white_background and iteration == adc.white_background_reset
         return iteration < self.config.stop and (iteration % adc.reset_every == 0 or is_extra)
 
@@ -120,7 +169,7 @@ class AdaptiveDensityControl(DensityStrategy):
 
         Raises ``UserError`` if no Gaussian would remain: such a fit cannot recover.
         """
-        adc, num_before = self.config.adc, population.num_rows
+        adc, num_before = self.settings, population.num_rows
         views = np.maximum(np.array(self.views, float), 1)
         norms = population.gather(np.array(self.gradient_norms, float) / views)
         with np.errstate(over="ignore"):
@@ -136,7 +185,7 @@ class AdaptiveDensityControl(DensityStrategy):
             )
         if num_added > 0 or len(chosen.keep) < num_before:
             append = self._new_rows(population, chosen, iteration) if num_added > 0 else None
-            population.edit(population.rows(chosen.keep), append)
+            population.edit(population.to_device_indices(chosen.keep), append)
         return DensityReport(
             num_added=num_added - len(chosen.split),
             cloned=len(chosen.clone),
@@ -151,7 +200,7 @@ class AdaptiveDensityControl(DensityStrategy):
 
         Gaussians that the photographs support regain opacity; floaters are pruned.
         """
-        opacity = self.config.adc.reset_opacity
+        opacity = self.settings.reset_opacity
         ceiling = math.log(opacity / (1 - opacity))
         logits = population.value("logit_opacities")
         population.replace("logit_opacities", dr.select(logits > ceiling, ceiling, logits))
@@ -172,9 +221,9 @@ class AdaptiveDensityControl(DensityStrategy):
         config, last = self.config, min(iterations, self.config.stop - 1)
         changes = max(0, last // config.every - config.start // config.every)
         doublings = math.log2(max(config.max_gaussians, start) / start)
-        if changes * math.log2(config.adc.split_count) >= doublings:
+        if changes * math.log2(self.settings.split_count) >= doublings:
             return max(start, config.max_gaussians)
-        return start * config.adc.split_count**changes
+        return start * self.settings.split_count**changes
 
     def _choose_rows(
         self,
@@ -189,7 +238,7 @@ class AdaptiveDensityControl(DensityStrategy):
         Comparisons are written such that NaN counts as transparent and as too large. Large ones are
         pruned once the first regular opacity reset is over.
         """
-        config, adc = self.config, self.config.adc
+        config, adc = self.config, self.settings
         small = scales <= adc.clone_scale * extent
         transparent = ~(opacities >= adc.prune_opacity)
         limit = adc.prune_scale * extent if iteration > adc.reset_every else np.inf
@@ -223,15 +272,15 @@ class AdaptiveDensityControl(DensityStrategy):
         clone is the same with n = 0.
         """
         num_clones = len(chosen.clone)
-        samples_of = np.repeat(chosen.split, self.config.adc.split_count)
+        samples_of = np.repeat(chosen.split, self.settings.split_count)
         normals = np.zeros((num_clones + len(samples_of), 3))
         random = np.random.default_rng([population.seed, iteration])
         normals[num_clones:] = random.standard_normal((len(samples_of), 3))
         log_shrink = np.zeros_like(normals)
-        log_shrink[num_clones:] = math.log(self.config.adc.split_shrink)
+        log_shrink[num_clones:] = math.log(self.settings.split_shrink)
 
         t = types_of(type(population.value("means").array))
-        rows = population.take(population.rows(np.append(chosen.clone, samples_of)))
+        rows = population.take(population.to_device_indices(np.append(chosen.clone, samples_of)))
         rows["means"] = displace_means(rows, normals)
         shrink = t.TensorXf(from_host(t.Float, log_shrink), normals.shape)
         rows["log_scales"] = rows["log_scales"] - shrink

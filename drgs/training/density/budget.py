@@ -21,12 +21,14 @@ from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
+from pydantic import Field
 from scipy.special import expit, logit
 from typing_extensions import override
 
-from drgs.config.density import SCHEDULES, DensifyConfig
+from drgs.config.density import DensifyConfig
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import CoarseStage, FitConfig
+from drgs.config.section import UNRESOLVED, Count, Resolved, Section
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
 from drgs.core.types import Float
@@ -55,24 +57,44 @@ HALF_OPACITY, HALF_OPACITY_RANGE = 0.6, (1e-4, 1 - 1e-4)
 """Factor of the halves' opacities, which overlap; and their range, so that logits stay small."""
 
 
-@STRATEGIES.register("budget")
+class BudgetConfig(Section):
+    """The strategy ``budget``: growth to a given number of Gaussians, where errors are largest."""
+
+    gaussians: Resolved[Count] = Field(
+        UNRESOLVED,
+        ge=4,
+        description="Number of Gaussians after two thirds of the changes. null: 250 times the "
+        "square root of an image's number of pixels, 100,000 for 400 x 400 px.",
+    )
+    error_every: Count = Field(
+        10,
+        ge=1,
+        description="Iterations between measurements of errors; each takes half an iteration.",
+    )
+    prune_opacity: float = Field(
+        0.05, ge=0, lt=1, description="Replace less opaque Gaussians by halves of others."
+    )
+
+
+@STRATEGIES.register("budget", section=BudgetConfig)
 @dataclass
 class GrowthToNumber(DensityStrategy):
     """Splits the Gaussians with the largest errors, up to the number allowed."""
 
     config: DensifyConfig
+    settings: BudgetConfig
     coarse: Sequence[CoarseStage] = ()
     errors: Float = NOT_BEGUN  # (N,): sum over views of s
     first: int = 0  # Gaussians at the start
     by_row = ("errors",)
-    start_share, stop_share, rate_decay = SCHEDULES["budget"]
+    stop_share, rate_decay = 3 / 4, 0.03
 
     @classmethod
     @override
     def from_config(
-        cls, config: FitConfig, dataset: Dataset | None, section: None
+        cls, config: FitConfig, dataset: Dataset | None, section: BudgetConfig
     ) -> GrowthToNumber:
-        return cls(config.densify, config.coarse or ())
+        return cls(config.densify, section, config.coarse or ())
 
     @override
     def begin(self, population: Population) -> None:
@@ -82,7 +104,7 @@ class GrowthToNumber(DensityStrategy):
     @override
     def needs_statistics(self, iteration: int) -> bool:
         """Return whether errors count: every so many views, at least once before a change."""
-        every, stop = self.config.budget.error_every, self.config.stop
+        every, stop = self.settings.error_every, self.config.stop
         if iteration < stop and iteration % every == 0:
             return True
         last_change = (iteration - 1) // self.config.every * self.config.every
@@ -106,7 +128,7 @@ class GrowthToNumber(DensityStrategy):
     @override
     def refine(self, population: Population, iteration: int) -> DensityReport:
         """Remove transparent Gaussians, and split those with the largest errors."""
-        before, least = population.num_rows, self.config.budget.prune_opacity
+        before, least = population.num_rows, self.settings.prune_opacity
         keep = expit(population.host("logit_opacities")) >= least  # NaN is transparent
         if not keep.any():
             raise UserError(
@@ -121,7 +143,7 @@ class GrowthToNumber(DensityStrategy):
         split = np.sort(candidates[:room])
         if len(split) > 0 or kept < before:
             keep[split] = False
-            rows = population.rows(np.flatnonzero(keep))
+            rows = population.to_device_indices(np.flatnonzero(keep))
             population.edit(rows, halves(population, split) if len(split) > 0 else None)
         self.begin(population)
         return DensityReport(
@@ -144,11 +166,11 @@ class GrowthToNumber(DensityStrategy):
         r: what the images' sizes are divided by: coarse images need fewer (DashGaussian, Chen
         et al. 2025). 1 at ``stop``: no change comes after it.
         """
-        start, stop = self.config.start, self.config.stop_at_iteration(iteration)
+        start, stop = self.config.start, self.config.stop
         u = min(max((iteration - start) / max(GROWTH_SHARE * (stop - start), 1), 0), 1)
         size = next((stage.factor for stage in self.coarse if iteration <= stage.until), 1)
         r = size if iteration < stop else 1
-        final = max(self.config.budget.gaussians, self.first)
+        final = max(self.settings.gaussians, self.first)
         return self.first + round((final - self.first) * u / r ** (2 - u))
 
     @override
@@ -162,7 +184,7 @@ class GrowthToNumber(DensityStrategy):
 
     @override
     def max_num_gaussians(self, start: int, iterations: int) -> int:
-        return max(start, min(self.config.budget.gaussians, self.config.max_gaussians))
+        return max(start, min(self.settings.gaussians, self.config.max_gaussians))
 
 
 def halves(population: Population, rows: np.ndarray) -> dict[str, dr.ArrayBase]:
@@ -171,7 +193,7 @@ def halves(population: Population, rows: np.ndarray) -> dict[str, dr.ArrayBase]:
     The halves' means lie on both sides of the Gaussian's, on its longest axis.
     """
     twice = np.tile(rows, 2)
-    new = population.take(population.rows(twice))
+    new = population.take(population.to_device_indices(twice))
     longest = population.host("log_scales")[twice].argmax(axis=1)
     offsets = np.zeros((len(twice), 3))
     offsets[np.arange(len(twice)), longest] = np.repeat([HALF_OFFSET, -HALF_OFFSET], len(rows))

@@ -14,7 +14,6 @@ from drgs.cameras.camera import Camera
 from drgs.cameras.lens import PINHOLE
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.config.approximations import Approximations
-from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import types_of
 from drgs.core.types import Float, TensorXf
@@ -40,7 +39,6 @@ MAX_SIDE_PX = 128  # of these images, which floaters cover in large part
 MIN_ALPHA = 0.01  # of a pixel with a depth
 
 
-@STRATEGIES.register("floaters")
 class Floaters(DensityStrategy):
     """Removes floaters three times during a fit; the Gaussians change in no other way.
 
@@ -81,7 +79,7 @@ class Floaters(DensityStrategy):
         if not floats.any() or floats.all():
             return None
         kept = np.flatnonzero(~floats)
-        population.edit(population.rows(kept))
+        population.edit(population.to_device_indices(kept))
         return DensityReport(num_gaussians=len(kept), pruned=len(floats) - len(kept))
 
     def find(self, gaussians: Gaussians[TensorXf]) -> np.ndarray:

@@ -14,12 +14,14 @@ from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
+from pydantic import Field
 from scipy.special import comb, expit, logit
 from typing_extensions import override
 
-from drgs.config.density import SCHEDULES, DensifyConfig
+from drgs.config.density import DensifyConfig
 from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
+from drgs.config.section import UNRESOLVED, Count, Resolved, Section
 from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
 from drgs.core.types import Array3f, Float, UInt32
@@ -44,19 +46,63 @@ _UNIT_OF_WORD = 2.0**-24
 """Scales the upper 24 bits of a random word, which float32 holds exactly, to [0, 1)."""
 
 
-@STRATEGIES.register("mcmc")
+class McmcConfig(Section):
+    """The strategy ``mcmc`` (Kheradmand et al. 2024): relocation, noise and regularisers."""
+
+    gaussians: Resolved[Count] = Field(
+        UNRESOLVED,
+        ge=4,
+        description="Final number of Gaussians. null: as with budget.",
+    )
+    growth: float = Field(
+        0.05, ge=0, le=10, description="Relative growth of the population at each change."
+    )
+    spread: float = Field(
+        1.0,
+        ge=0,
+        le=10,
+        description="Displacement of copies, in standard deviations; 0 in the paper.",
+    )
+    min_opacity: float = Field(
+        0.005, gt=0, lt=1, description="Relocate Gaussians up to this opacity."
+    )
+    noise_lr: float = Field(
+        1e5,
+        ge=0,
+        le=1e12,
+        description="Factor of the noise on means, times their rate and the covariance in squared "
+        "scene extents. The paper's value, about 1e7, costs 2 dB in small images.",
+    )
+    opacity_weight: float = Field(
+        0.01, ge=0, le=1e6, description="Weight of the mean opacity in the loss."
+    )
+    scale_weight: float = Field(
+        0.05, ge=0, le=1e6, description="Weight of the mean scale, in scene extents, in the loss."
+    )
+
+    @override
+    def check(self, config: FitConfig) -> None:
+        """Refuse more points at the start than Gaussians in the end."""
+        if config.densify.strategy == "mcmc":
+            config.require_room("densify.mcmc.gaussians", self.gaussians)
+
+
+@STRATEGIES.register("mcmc", section=McmcConfig)
 @dataclass
 class MarkovChain(DensityStrategy):
     """Relocates transparent Gaussians, and adds noise to means."""
 
     config: DensifyConfig
+    settings: McmcConfig
     extent: float = math.nan  # of the scene, world units; known when it begins
-    start_share, stop_share, rate_decay = SCHEDULES["mcmc"]
+    stop_share = 5 / 7
 
     @classmethod
     @override
-    def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> MarkovChain:
-        return cls(config.densify)
+    def from_config(
+        cls, config: FitConfig, dataset: Dataset | None, section: McmcConfig
+    ) -> MarkovChain:
+        return cls(config.densify, section)
 
     @override
     def begin(self, population: Population) -> None:
@@ -65,12 +111,12 @@ class MarkovChain(DensityStrategy):
     @property
     def cap(self) -> int:
         """Final number of Gaussians; a larger initial population does not grow."""
-        return min(self.config.mcmc.gaussians, self.config.max_gaussians)
+        return min(self.settings.gaussians, self.config.max_gaussians)
 
     @override
     def penalties(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Iterator[Float]:
         """Yield the paper's equation 10: mean opacity, and mean scale in scene extents."""
-        config, logits = self.config.mcmc, parameters["logit_opacities"]
+        config, logits = self.settings, parameters["logit_opacities"]
         log_scales = parameters["log_scales"].array
         if config.opacity_weight > 0:
             yield _mean(1 / (1 + dr.exp(-logits)), config.opacity_weight, num_rows)
@@ -85,7 +131,7 @@ class MarkovChain(DensityStrategy):
         own axes, and of transparent ones only. The strength is noise_lr times the means' rate;
         Sigma is in squared scene extents, so that a scene of another size is the same fit.
         """
-        config = self.config.mcmc
+        config = self.settings
         if config.noise_lr == 0:
             return
         means, quats, log_scales, logits = (
@@ -120,7 +166,7 @@ class MarkovChain(DensityStrategy):
 
         Raises ``UserError`` if all are too transparent.
         """
-        config, before = self.config.mcmc, population.num_rows
+        config, before = self.settings, population.num_rows
         opacities = expit(population.host("logit_opacities"))
         alive = opacities > config.min_opacity  # a NaN is not
         num_alive = int(np.count_nonzero(alive))
@@ -139,9 +185,9 @@ class MarkovChain(DensityStrategy):
             offsets[: len(drawn)] = 0
             rows["means"] = displace_means(rows, config.spread * offsets)
             alive[drawn] = False
-            population.edit(population.rows(np.flatnonzero(alive)), rows)
+            population.edit(population.to_device_indices(np.flatnonzero(alive)), rows)
         elif num_alive < before:
-            population.edit(population.rows(np.flatnonzero(alive)))
+            population.edit(population.to_device_indices(np.flatnonzero(alive)))
         relocated = min(before - num_alive, len(copied))
         return DensityReport(
             num_gaussians=aim,
@@ -185,7 +231,7 @@ def _copies(
     drawn, counts = np.unique(copied, return_counts=True)
     shared, factors = correct_copies(opacities[drawn], counts + 1)
     shared = np.clip(shared, min_opacity, MAX_OPACITY)
-    rows = population.take(population.rows(np.append(drawn, copied)))
+    rows = population.take(population.to_device_indices(np.append(drawn, copied)))
     # Of each new row, the place of its source among those that were drawn.
     source = np.append(np.arange(len(drawn)), np.searchsorted(drawn, copied))
     t = types_of(type(rows["logit_opacities"]))

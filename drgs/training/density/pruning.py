@@ -9,32 +9,33 @@ import drjit as dr
 import numpy as np
 from typing_extensions import override
 
-from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
-from drgs.core.arrays import from_host, types_of
-from drgs.core.types import Float, TensorXf
-from drgs.datasets.types import Dataset
+from drgs.core.arrays import types_of
 from drgs.training.density.strategy import (
-    NOT_BEGUN,
     DensityReport,
     DensityStrategy,
-    PixelWeight,
     Population,
-    StepInfo,
 )
+
+MIN_OPACITY = 0.005
+"""Less opaque Gaussians are removed."""
+
+OPACITY_RATE_FACTOR = 4.0
+"""Factor of ``optimizer.opacities_lr`` during the phase."""
 
 MAX_PRESSURE = 1.0
 """Most by which logits are lowered at one time: an opacity of 0.5 becomes 0.27, which Adam makes
 good within some ten iterations at four times the usual rate."""
 
 
-class Pruning(DensityStrategy):
-    """A last phase; subclasses choose the Gaussians that are removed."""
+class NaturalSelection(DensityStrategy):
+    """Lowers all opacities, and removes Gaussians that become transparent.
 
-    @classmethod
-    @override
-    def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> Pruning:
-        return cls(config)
+    The loss raises the opacities of Gaussians that matter, at a higher learning rate; the others
+    fall below a threshold (GNS, Gaussian natural selection).
+    """
+
+    num_left = 0  # Gaussians after the last change
 
     def __init__(self, config: FitConfig) -> None:
         self.prune = config.densify.prune
@@ -51,7 +52,8 @@ class Pruning(DensityStrategy):
     @override
     def is_due(self, iteration: int) -> bool:
         due = iteration % self.prune.every == 0 or iteration == self.stop
-        return self.contains(iteration) and due
+        is_over = 0 < self.num_left <= self.to
+        return self.contains(iteration) and due and not is_over
 
     def goal(self, iteration: int, before: int) -> int:
         """Return the number to be left after an iteration: each change removes the same share.
@@ -64,80 +66,10 @@ class Pruning(DensityStrategy):
         share = (iteration - self.start) / (self.stop - self.start)
         return round(before * (self.to / before) ** share)
 
-
-@STRATEGIES.register("importance")
-class Importance(Pruning):
-    """Removes Gaussians by their contribution to images.
-
-    A Gaussian's score is the sum of its weights T a (3DGS, equation 3) over the pixels of the
-    images of the phase so far (as in Mini-Splatting, Fang and Wang 2024, section 4.2). Those of the
-    lowest scores are removed, a few at a time, so that the rest can compensate.
-    Each image of the phase takes about half as long again.
-    """
-
-    by_row = ("weights",)
-    scores: Float = NOT_BEGUN  # (N,)
-
-    @override
-    def begin(self, population: Population) -> None:
-        self.scores = population.zeros()
-
-    @override
-    def needs_statistics(self, iteration: int) -> bool:
-        return self.contains(iteration)
-
-    @override
-    def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
-        return {"coverage": _ones}
-
-    @override
-    def update_statistics(self, step: StepInfo) -> None:
-        self.scores = self.scores + step.weighted_sums["coverage"]
-        dr.eval(self.scores)
-
-    @override
-    def refine(self, population: Population, iteration: int) -> DensityReport | None:
-        before = population.num_rows
-        self.num_before = self.num_before or before
-        scores = population.gather(self.scores)
-        count = min(before, self.goal(iteration, self.num_before))
-        if count == before:
-            return None
-        report = keep_best(population, scores, count)
-        # The remaining scores are kept: few views were rendered since the last change.
-        left = population.local(scores[best_rows(scores, count)])
-        self.scores = from_host(type(self.scores), left)
-        return report
-
-    @override
-    def state(self) -> dict[str, np.ndarray]:
-        return {"pruned_from": np.array(self.num_before), "weights": np.array(self.scores)}
-
-    @override
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        self.num_before = int(state["pruned_from"])
-        self.scores = from_host(type(self.scores), state["weights"])
-
-
-@STRATEGIES.register("selection")
-class NaturalSelection(Pruning):
-    """Lowers all opacities, and removes Gaussians that become transparent.
-
-    The loss raises the opacities of Gaussians that matter, at a higher learning rate; the others
-    fall below a threshold (GNS, Gaussian natural selection).
-    """
-
-    num_left = 0  # Gaussians after the last change
-
     @override
     def rate_factors(self, iteration: int) -> Mapping[str, float]:
         under_pressure = self.num_left > self.to and self.contains(iteration)
-        return {"logit_opacities": self.prune.opacity_rate if under_pressure else 1.0}
-
-    @override
-    def is_due(self, iteration: int) -> bool:
-        is_over = 0 < self.num_left <= self.to
-        return super().is_due(iteration) and not is_over
+        return {"logit_opacities": OPACITY_RATE_FACTOR if under_pressure else 1.0}
 
     @override
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
@@ -147,7 +79,7 @@ class NaturalSelection(Pruning):
         the least opaque are removed until few enough are left.
         """
         logits = population.host("logit_opacities")
-        threshold = math.log(self.prune.opacity / (1 - self.prune.opacity))
+        threshold = math.log(MIN_OPACITY / (1 - MIN_OPACITY))
         self.num_left = before = count = len(logits)
         self.num_before = self.num_before or before
         surplus = before - self.goal(iteration, self.num_before)
@@ -174,18 +106,11 @@ class NaturalSelection(Pruning):
         self.num_before, self.num_left = int(state["pruned_from"]), int(state["pruned_to"])
 
 
-def best_rows(scores: np.ndarray, count: int) -> np.ndarray:
-    """Return the ``count`` rows of the highest scores (N,), ascending; ties: the first rows."""
-    order = np.argsort(-scores, kind="stable")  # a NaN comes last
-    return np.sort(order[:count])
-
-
 def keep_best(population: Population, scores: np.ndarray, count: int) -> DensityReport:
-    """Remove all but the ``count`` rows of the highest scores (N,), which keep their moments."""
-    population.edit(population.rows(best_rows(scores, count)))
+    """Remove all but the ``count`` rows of the highest scores (N,), which keep their moments.
+
+    Of equal scores, the first ones stay.
+    """
+    order = np.argsort(-scores, kind="stable")  # a NaN comes last
+    population.edit(population.to_device_indices(np.sort(order[:count])))
     return DensityReport(num_gaussians=count, pruned=len(scores) - count)
-
-
-def _ones(image: TensorXf, photograph: TensorXf) -> Float:
-    height, width, _ = image.shape
-    return dr.opaque(type(image.array), 1, height * width)

@@ -2,23 +2,19 @@
 
 Each iteration, :class:`drgs.training.trainer.Trainer` passes statistics (:class:`StepInfo`) to the
 strategy and lets it act on the rows of the optimizer
-(:class:`drgs.training.optimizer.Population`). Iterations are counted from 1. Where a plan is
-revised, another strategy is made and given :meth:`DensityStrategy.state`.
+(:class:`drgs.training.optimizer.Population`). Iterations are counted from 1.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from itertools import chain
+from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 import drjit as dr
 import numpy as np
-from typing_extensions import override
 
-from drgs.config.density import DEFAULT_SCHEDULE
-from drgs.config.extensions import STRATEGIES, section_of
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.types import Array2f, Bool, Float, TensorXf
@@ -103,9 +99,12 @@ class DensityStrategy(Protocol):
 
     by_row: Sequence[str] = ()  # names in :meth:`state` of arrays with a row for each Gaussian
 
-    start_share, stop_share, rate_decay = DEFAULT_SCHEDULE
-    """Shares of the iterations, for schedules that are not given: ``densify.start`` is at most the
-    first (and half of stop), ``densify.stop`` at most the second; and ``optimizer.decay``."""
+    start_share, stop_share, latest_stop = 1 / 20, 1 / 2, math.inf
+    """For schedules that are not given: shares of the iterations that are at most ``densify.start``
+    (which is at most half of stop, too) and ``densify.stop``, and the latest iteration of it."""
+
+    rate_decay = 0.1  # ``optimizer.decay`` that is not given
+    begins_coarse = True  # whether ``coarse`` that is not given may be other than empty
 
     def begin(self, population: Population) -> None:
         """Reset the statistics: at the start, and after changes by other strategies."""
@@ -165,109 +164,3 @@ class DensityStrategy(Protocol):
         Called for an estimate, without :meth:`begin`.
         """
         return start
-
-
-def density_strategy(
-    config: FitConfig, dataset: Dataset | None = None, growth: DensityStrategy | None = None
-) -> DensityStrategy:
-    """Return the strategy of a fit: growth, and what removes floaters and the least Gaussians.
-
-    dataset: None for an estimate; growth: a strategy instead of ``densify.strategy``.
-    """
-
-    def make(name: str) -> DensityStrategy:
-        strategy = STRATEGIES.get(name, "densify.strategy")
-        section = section_of(strategy, config.extensions)
-        return strategy.value.from_config(config, dataset, section)
-
-    growth = make(config.densify.strategy) if growth is None else growth
-    phases = [growth]
-    if config.densify.remove_floaters:
-        phases.append(make("floaters"))
-    if config.densify.prune.to is not None:
-        phases.append(make(config.densify.prune.method))
-    return growth if len(phases) == 1 else Phases(phases)
-
-
-class Phases(DensityStrategy):
-    """A sequence of strategies; if one changes rows, the others are reset."""
-
-    def __init__(self, phases: Sequence[DensityStrategy]) -> None:
-        self.phases = phases
-        self.by_row = [name for phase in phases for name in phase.by_row]
-
-    @override
-    def begin(self, population: Population) -> None:
-        for phase in self.phases:
-            phase.begin(population)
-
-    @override
-    def needs_statistics(self, iteration: int) -> bool:
-        return any(phase.needs_statistics(iteration) for phase in self.phases)
-
-    @override
-    def pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
-        needed = [phase for phase in self.phases if phase.needs_statistics(iteration)]
-        return {k: v for phase in needed for k, v in phase.pixel_weights(iteration).items()}
-
-    @override
-    def update_statistics(self, step: StepInfo) -> None:
-        for phase in self.phases:
-            if phase.needs_statistics(step.iteration):
-                phase.update_statistics(step)
-
-    @override
-    def penalties(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Iterator[Float]:
-        return chain.from_iterable(p.penalties(parameters, num_rows) for p in self.phases)
-
-    @override
-    def rate_factors(self, iteration: int) -> Mapping[str, float]:
-        product: dict[str, float] = {}
-        for phase in self.phases:
-            for name, factor in phase.rate_factors(iteration).items():
-                product[name] = product.get(name, 1.0) * factor
-        return product
-
-    @override
-    def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
-        for phase in self.phases:
-            phase.perturb(population, iteration, means_lr)
-
-    @override
-    def is_due(self, iteration: int) -> bool:
-        return any(phase.is_due(iteration) for phase in self.phases)
-
-    @override
-    def refine(self, population: Population, iteration: int) -> DensityReport | None:
-        """Let the phases that are due act, one after the other; return the sum of the reports."""
-        total: DensityReport | None = None
-        for phase in self.phases:
-            report = phase.refine(population, iteration) if phase.is_due(iteration) else None
-            if report is not None:
-                for other in self.phases:
-                    if other is not phase:
-                        other.begin(population)
-                total = report if total is None else _sum(total, report)
-        return total
-
-    @override
-    def state(self) -> dict[str, np.ndarray]:
-        return {name: v for phase in self.phases for name, v in phase.state().items()}
-
-    @override
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        for phase in self.phases:
-            phase.restore(state)
-
-    @override
-    def max_num_gaussians(self, start: int, iterations: int) -> int:
-        """Return the largest number of all phases."""
-        most = start
-        for phase in self.phases:
-            most = max(most, phase.max_num_gaussians(most, iterations))
-        return most
-
-
-def _sum(first: DensityReport, second: DensityReport) -> DensityReport:
-    counts = {name: count + getattr(second, name) for name, count in asdict(first).items()}
-    return DensityReport(**{**counts, "num_gaussians": second.num_gaussians})

@@ -17,11 +17,12 @@ import numpy as np
 from typing_extensions import override
 
 from drgs.config.schema import FitConfig
+from drgs.core.adam import LeanAdam
 from drgs.core.arrays import from_host
 from drgs.core.errors import UserError
 from drgs.core.types import Float, UInt32
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.training.optimizer import LeanAdam, Population
+from drgs.training.optimizer import Population
 from drgs.training.parallel.communicator import Communicator
 
 
@@ -137,7 +138,7 @@ class ShardedPopulation(Population):
         wanted = np.array(rows)
         owners = self.shard.owners(wanted)
         place = np.argsort(owners, kind="stable")
-        local = self.rows(wanted[owners == self.shard.rank] - self.first_row)
+        local = self.to_device_indices(wanted[owners == self.shard.rank] - self.first_row)
         taken = {}
         for name, values in super().take(local).items():
             gathered = self.comm.all_gather_rows(np.array(values).reshape(values.shape))

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 
-from drgs.__main__ import COMMANDS
+from drgs.__main__ import commands
 from support.attacks.attack import Attack, Changes, Killed, observed
 from support.attacks.attack_folder import AttackFolder, contents, current_folder, stub_results
 
@@ -67,7 +67,7 @@ def trial(attack: Attack, attack_folder: AttackFolder) -> list[str]:
 
 def run(attack: Attack) -> Outcome:
     """Call the command as its process would be; in the current folder."""
-    main = import_module(COMMANDS[attack.command].module).main
+    main = import_module(commands()[attack.command].module).main
     outcome = Outcome()
     with (
         nullcontext() if attack.draws else stub_results(),

@@ -7,7 +7,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
-from drgs.__main__ import COMMANDS
+from drgs.__main__ import commands
 from drgs.cli.commands import CommandParser
 from drgs.config.approximations import DECLARED
 from drgs.config.load import known_keys
@@ -45,7 +45,7 @@ ENABLING_SETTINGS = {
 }
 """Further values that make a key or section take effect."""
 
-LISTS = ("coarse", "optimizer.means_lr_aims", "densify.stop_aims")
+LISTS = ("coarse",)
 """Keys whose values are lists of sections."""
 
 
@@ -119,7 +119,7 @@ def option_attacks() -> Iterator[Attack]:
     """Each option that takes values, and the positional argument, with each of the words above."""
     for kind, (command, base, given) in BASES.items():
         parser = CommandParser(prog=command)
-        import_module(COMMANDS[command].module).add_arguments(parser)
+        import_module(commands()[command].module).add_arguments(parser)
         for action in parser._actions:  # argparse has no other list
             option = action.option_strings[0] if action.option_strings else ""
             is_known = given is RENDER_WORDS and (not option or option in base)

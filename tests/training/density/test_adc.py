@@ -12,7 +12,7 @@ from drgs.config.schema import DensifyConfig
 from drgs.core.errors import UserError
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
-from drgs.training.density.adc import AdaptiveDensityControl
+from drgs.training.density.adc import AdaptiveDensityControl, AdcConfig
 from drgs.training.density.strategy import StepInfo
 
 EARLY, LATE = 600, 3100  # before and after the first opacity reset of the default schedule
@@ -21,13 +21,13 @@ HIGH = 3e-4  # a mean gradient norm above the default threshold of 2e-4
 
 
 def config_of(max_gaussians=1_000_000, **adc):
-    return DensifyConfig(max_gaussians=max_gaussians, adc=adc)
+    return DensifyConfig(max_gaussians=max_gaussians), AdcConfig(**adc)
 
 
 def run(optimizer, gradient_norms, iteration=EARLY, seed=0, **config):
     norms = np.asarray(gradient_norms, np.float32)
     strategy = AdaptiveDensityControl(
-        config_of(**config), False, Float(4 * norms), dr.full(Float, 4, len(norms))
+        *config_of(**config), False, Float(4 * norms), dr.full(Float, 4, len(norms))
     )
     return strategy.densify_and_prune(rows_of(optimizer, seed), iteration)
 
@@ -40,7 +40,7 @@ def test_statistics_are_gradient_norms_in_ndc_over_visible_views(as_tensor):
     visible = random.random((3, num)) < 0.6
     visible[:, 2] = False
     gradients[~visible] = np.nan
-    result = AdaptiveDensityControl(DensifyConfig())
+    result = AdaptiveDensityControl(*config_of())
     result.begin(rows_of(make([SMALL] * num, 0.5)))
     for gradient, is_seen in zip(gradients, visible, strict=True):
         pixel = TensorXf(gradient) if as_tensor else Array2f(gradient.T)
@@ -55,8 +55,8 @@ def test_statistics_are_gradient_norms_in_ndc_over_visible_views(as_tensor):
 @pytest.mark.parametrize(("white", "first"), [(False, 20), (True, 20), (True, None)])
 def test_schedule_matches_the_reference_training_loop(white, first):
     adc = {"reset_every": 60, "white_background_reset": first}
-    config = DensifyConfig(start=20, stop=200, every=10, adc=adc)
-    strategy = AdaptiveDensityControl(config, white)
+    config = DensifyConfig(start=20, stop=200, every=10)
+    strategy = AdaptiveDensityControl(config, AdcConfig(**adc), white)
     for i in range(1, 300):
         densify = reset = False
         if i < 200:
@@ -101,22 +101,22 @@ def test_last_gaussian_is_not_pruned_silently():
     assert rows_of(optimizer).num_rows == 2
 
 
-def naive_decisions(norms, scales, opacities, large_is_pruned, config):
+def naive_decisions(norms, scales, opacities, large_is_pruned, config, settings):
     """The rules, one Gaussian after the other: (kept, cloned, split) row numbers."""
-    limit = config.adc.prune_scale * EXTENT if large_is_pruned else math.inf
+    limit = settings.prune_scale * EXTENT if large_is_pruned else math.inf
     kinds = []
     for norm, scale, opacity in zip(norms, scales, opacities, strict=True):
-        if not opacity >= config.adc.prune_opacity:  # also NaN
+        if not opacity >= settings.prune_opacity:  # also NaN
             kinds.append("prune")
-        elif norm >= config.adc.grad_threshold:
-            kinds.append("clone" if scale <= config.adc.clone_scale * EXTENT else "split")
+        elif norm >= settings.grad_threshold:
+            kinds.append("clone" if scale <= settings.clone_scale * EXTENT else "split")
         else:
             kinds.append("prune" if scale > limit else "keep")
     room = config.max_gaussians - sum(kind != "prune" for kind in kinds)
     candidates = [i for i, kind in enumerate(kinds) if kind in ("clone", "split")]
     full = False
     for i in sorted(candidates, key=lambda i: (-norms[i], i)):
-        cost = 1 if kinds[i] == "clone" else config.adc.split_count - 1
+        cost = 1 if kinds[i] == "clone" else settings.split_count - 1
         full = full or cost > room
         if full:
             kinds[i] = "prune" if scales[i] > limit else "keep"
@@ -146,11 +146,11 @@ def test_random_populations_follow_rules_and_cap(seed):
     report = run(optimizer, norms, iteration=iteration, seed=seed, **config)
     after = values(optimizer)
 
-    config = config_of(**config)
+    config, settings = config_of(**config)
     kept, cloned, split = naive_decisions(
-        norms.astype(float), scales, opacities, iteration == LATE, config
+        norms.astype(float), scales, opacities, iteration == LATE, config, settings
     )
-    parents = [*kept, *cloned, *np.repeat(split, config.adc.split_count)]
+    parents = [*kept, *cloned, *np.repeat(split, settings.split_count)]
     assert report.num_gaussians == rows_of(optimizer).num_rows == len(parents)
     assert report.num_gaussians <= max(config.max_gaussians, len(kept))
     assert (report.cloned, report.split) == (len(cloned), len(split))
@@ -183,10 +183,10 @@ def test_equal_seeds_give_equal_bytes():
 
 
 def test_reset_lowers_opacities_and_clears_only_their_moments():
-    config = DensifyConfig()
+    config, settings = config_of()
     optimizer = make([SMALL] * 3, [0.9, 0.01001, 0.007])
     before, (means_m, _) = values(optimizer), moments(optimizer, "means")
-    AdaptiveDensityControl(config).reset_opacities(rows_of(optimizer))
+    AdaptiveDensityControl(config, settings).reset_opacities(rows_of(optimizer))
     after = values(optimizer)
     opacities = reference.sigmoid(after["logit_opacities"].astype(float))
     # 1e-6: single precision of a logit of -4.6.

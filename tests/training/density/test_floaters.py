@@ -13,7 +13,8 @@ from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
 from drgs.training.density.floaters import Floaters
-from drgs.training.density.strategy import DensityReport, density_strategy
+from drgs.training.density.phases import density_strategy
+from drgs.training.density.strategy import DensityReport
 
 NUM_VIEWS, SIDE, NEAR = 16, 40, 0.2
 DIRECT = Approximations(antialiased=False, low_pass=0.3)

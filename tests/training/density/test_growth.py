@@ -15,12 +15,13 @@ from drgs.config.density import DensifyConfig
 from drgs.config.schema import CoarseStage
 from drgs.core.errors import UserError
 from drgs.reference import splatting as reference
-from drgs.training.density.budget import GrowthToNumber, halves
+from drgs.training.density.budget import BudgetConfig, GrowthToNumber, halves
 
 
 def strategy(optimizer, errors, first=None, **config):
     values = {"strategy": "budget", "start": 100, "stop": 1000, "every": 50, **config}
-    made = GrowthToNumber(DensifyConfig.model_validate(values))
+    config = DensifyConfig.model_validate(values)
+    made = GrowthToNumber(config, config.section("budget", BudgetConfig))
     made.first = first or rows_of(optimizer).num_rows
     made.errors = Float(np.asarray(errors, np.float32))
     return made
@@ -128,7 +129,7 @@ def test_each_change_has_accumulated_errors(every, stop, error_every):
     """If there were none since the last change, errors of its own view are used."""
     budget = {"gaussians": 70, "error_every": error_every}
     config = DensifyConfig(start=1, stop=stop, every=every, budget=budget)
-    growth, seen = GrowthToNumber(config), 0
+    growth, seen = GrowthToNumber(config, config.section("budget", BudgetConfig)), 0
     for iteration in range(1, stop + 5):
         seen += growth.needs_statistics(iteration)
         if growth.is_due(iteration):
@@ -139,8 +140,8 @@ def test_each_change_has_accumulated_errors(every, stop, error_every):
 
 def test_target_is_reached_with_coarse_images_until_the_end_of_growth():
     coarse = [CoarseStage(until=1000, factor=2)]
-    config = DensifyConfig(start=100, stop=1000, every=100, budget={"gaussians": 90})
-    growth = GrowthToNumber(config, coarse, first=50)
+    config = DensifyConfig(start=100, stop=1000, every=100)
+    growth = GrowthToNumber(config, BudgetConfig(gaussians=90), coarse, first=50)
     early, late = (50 + round(40 * u / 2 ** (2 - u)) for u in (1 / 3, 1))
     assert [growth.goal(i) for i in (300, 700, 900, 1000)] == [early, late, late, 90]
 

@@ -20,6 +20,7 @@ from drgs.reference import splatting as reference
 from drgs.training.density.mcmc import (
     MAX_COPIES,
     MarkovChain,
+    McmcConfig,
     correct_copies,
     normals,
     pcg4d,
@@ -32,8 +33,8 @@ SIZE, DEAD = 0.05, 0.001
 def strategy(max_gaussians=1_000_000, **mcmc):
     """Copies lie where their sources are, unless the test is about that."""
     mcmc = {"gaussians": 100_000, "spread": 0.0} | mcmc
-    config = DensifyConfig(start=500, stop=15_000, max_gaussians=max_gaussians, mcmc=mcmc)
-    result = MarkovChain(config)
+    config = DensifyConfig(start=500, stop=15_000, max_gaussians=max_gaussians)
+    result = MarkovChain(config, McmcConfig(**mcmc))
     result.begin(rows_of(make([SIZE], 0.5)))
     return result
 

@@ -1,17 +1,14 @@
 """The last phase of a population: when it acts, and what it removes."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-from drjit.llvm.ad import Float
 from scipy.special import expit, logit
 from support.populations import make, moments, rows_of, values
 
 from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.training.density.pruning import MAX_PRESSURE, Importance, NaturalSelection, keep_best
+from drgs.training.density.pruning import MAX_PRESSURE, NaturalSelection, keep_best
 
 SIZE = 0.05
 
@@ -22,24 +19,19 @@ def config_of(iterations=4000, grows_until=2000, **prune):
     )
 
 
-def step_with(weights):
-    """An iteration, as far as an importance reads it."""
-    return SimpleNamespace(weighted_sums={"coverage": Float(weights)})
-
-
 def test_the_phase_follows_growth_and_leaves_half_of_what_is_left():
-    schedule = Importance(config_of(to=100))
+    schedule = NaturalSelection(config_of(to=100))
     assert (schedule.start, schedule.stop) == (2000, 3000)
     config = FitConfig(data={"path": "."}, densify={"prune": {"to": 9}})
-    reference = Importance(config)
+    reference = NaturalSelection(config)
     assert (reference.start, reference.stop) == (22_500, 26_250)
     assert [i for i in range(5000) if schedule.is_due(i)] == list(range(2050, 3001, 50))
     config = config_of(to=100, start=2500, stop=2730, every=100)
-    assert [i for i in range(5000) if Importance(config).is_due(i)] == [2600, 2700, 2730]
-    later = Importance(with_changes(config, {"densify.stop": 2600}))
+    assert [i for i in range(5000) if NaturalSelection(config).is_due(i)] == [2600, 2700, 2730]
+    later = NaturalSelection(with_changes(config, {"densify.stop": 2600}))
     assert (later.start, later.stop) == (2600, 2730)
     # Each change leaves the same share, and the last one the number.
-    schedule = Importance(config_of(to=100, start=1000, stop=1400, grows_until=900))
+    schedule = NaturalSelection(config_of(to=100, start=1000, stop=1400, grows_until=900))
     wanted = [schedule.goal(i, 1600) for i in (1100, 1200, 1300, 1400)]
     assert wanted == [800, 400, 200, 100]
     assert schedule.goal(1100, 100) == schedule.goal(1100, 50) == 100
@@ -110,15 +102,11 @@ def test_opacities_are_faster_while_they_are_under_pressure():
 def test_random_populations_end_with_the_number(seed):
     random = np.random.default_rng(seed)
     num, to = map(int, random.integers(4, 100, 2))  # both more and fewer than the number
-    method = (NaturalSelection, Importance)[seed % 2]
-    phase = method(config_of(to=to))
+    phase = NaturalSelection(config_of(to=to))
     optimizer = make([SIZE] * num, random.uniform(0.001, 0.99, num), seed=seed)
     rows, left, before = rows_of(optimizer), num, values(optimizer)
-    phase.begin(rows)
     for iteration in range(2000, 3001):
         if phase.is_due(iteration):
-            if phase.needs_statistics(iteration):
-                phase.update_statistics(step_with(random.random(rows.num_rows)))
             report = phase.refine(rows, iteration)
             assert min(num, to) <= rows.num_rows <= left
             assert report is None or report.pruned == left - rows.num_rows
@@ -126,23 +114,6 @@ def test_random_populations_end_with_the_number(seed):
     assert left == min(num, to)
     for name, value in values(optimizer).items():
         assert num > to or np.array_equal(value, before[name])  # too few: nothing changes
-
-
-def test_those_that_show_least_in_the_phase_go():
-    """Not since the last change: that is fewer views than there are."""
-    optimizer = make([SIZE] * 8, 0.5)
-    before = values(optimizer)["means"]
-    phase = Importance(config_of(to=2))
-    rows = rows_of(optimizer)
-    phase.begin(rows)
-    phase.update_statistics(step_with([5, 0, 1, 2, 0, 3, 2, 1]))
-    phase.update_statistics(step_with([0, 9, 0, 0, 8, 0, 0, 0]))
-    assert phase.refine(rows, 2500).num_gaussians == 4
-    np.testing.assert_array_equal(values(optimizer)["means"], before[[0, 1, 4, 5]])
-    phase.update_statistics(step_with([2, 0, 0, 6]))
-    assert phase.refine(rows, 3000).num_gaussians == 2
-    np.testing.assert_array_equal(values(optimizer)["means"], before[[1, 5]])
-    assert np.array(phase.scores).tolist() == [9, 9]
 
 
 @pytest.mark.parametrize(

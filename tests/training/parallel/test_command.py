@@ -4,10 +4,7 @@ import csv
 import json
 import os
 import random
-import shutil
 import signal
-import subprocess
-import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -220,38 +217,3 @@ def test_death_of_a_process_ends_all_and_the_fit_resumes(config, tmp_path, seed)
     assert_all_end(out)
     assert parallel_processes.run(2, command("--resume", out))[0] == 0
     assert (out / "metrics.json").exists()
-
-
-SMALL_DISK_SCRIPT = """
-disk=$1 kept=$2
-shift 2
-mount -t tmpfs -o size=600k none "$disk" || exit 77
-"$@"
-status=$?
-cp -r "$disk" "$kept"
-exit $status
-"""
-
-
-@pytest.mark.slow
-def test_full_disk_ends_all_processes_and_the_fit_resumes(config, tmp_path):
-    """One checkpoint has room, and not another one beside it, as it is written."""
-    if os.geteuid() != 0 or shutil.which("unshare") is None:
-        pytest.skip("only root can mount a small disk")
-    path, disk, kept = config(iterations=800), tmp_path / "disk", tmp_path / "kept"
-    disk.mkdir()
-    launcher = [parallel_processes.mpiexec(), "-n", "2", sys.executable]
-    words = [*launcher, *command(path, "--out", disk / "out")]
-    done = subprocess.run(
-        ["unshare", "--mount", "sh", "-c", SMALL_DISK_SCRIPT, "-", disk, kept, *words],
-        cwd=parallel_processes.REPOSITORY,
-        env=parallel_processes.environment(),
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    if done.returncode == 77:
-        pytest.skip("no small disk can be mounted")
-    assert done.returncode == 2
-    assert done.stderr.count("error: ") == 1 and "No space left" in done.stderr
-    assert parallel_processes.run(3, command("--resume", kept / "out"))[0] == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -10,12 +11,14 @@ import numpy as np
 from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
-from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.core.types import TensorXf
-from drgs.datasets.types import Dataset, View
-from drgs.training.effects.base import FitState, TrainingEffect, TrainingView, as_tensor
-from drgs.training.losses import prepare_target
+from drgs.effects.base import SimulatedEffect, TrainingEffect, as_tensor
+
+if TYPE_CHECKING:
+    from drgs.config.schema import FitConfig
+    from drgs.datasets.types import Dataset, View
+    from drgs.training.views import FitState, TrainingView
 
 RANDOM_STREAM = 71  # separates the random numbers of backgrounds from others of the same seed
 
@@ -34,8 +37,16 @@ class RandomBackground(TrainingEffect):
     The colours are functions of seed and iteration.
     """
 
-    name = "background"
+    order = 30
     upload_bytes = 12
+
+    @classmethod
+    @override
+    def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
+        if not config.data.random_background:
+            return []
+        what = "a random colour at each iteration"
+        return [SimulatedEffect("background", what, "data.random_background")]
 
     @classmethod
     @override
@@ -45,16 +56,11 @@ class RandomBackground(TrainingEffect):
                 "data.random_background: the photographs must be transparent where the background "
                 "is to be seen, got opaque ones"
             )
-        return cls(config.seed, dataset.background, config.loss.window, config.loss.sigma)
+        return cls(config.seed, dataset.background)
 
-    def __init__(
-        self, seed: int, background: tuple[float, float, float], window: int, sigma: float
-    ) -> None:
-        """background: behind the photographs, display space.
-
-        window, sigma: of SSIM, px: see :func:`drgs.training.losses.prepare_target`.
-        """
-        self.seed, self.background, self.window = seed, np.array(background), (window, sigma)
+    def __init__(self, seed: int, background: tuple[float, float, float]) -> None:
+        """background: behind the photographs, display space."""
+        self.seed, self.background = seed, np.array(background)
 
     @override
     def upload(self, view: View) -> TensorXf:
@@ -76,7 +82,7 @@ class RandomBackground(TrainingEffect):
         channel = dr.arange(mi.UInt32, dr.width(transparent.array)) % 3
         shift = dr.select(channel == 0, shift.x, dr.select(channel == 1, shift.y, shift.z))
         image = view.photograph.image.array + transparent.array * shift
-        view.replacement = prepare_target(type(transparent)(image, transparent.shape), *self.window)
+        view.replace_photograph(type(transparent)(image, transparent.shape))
 
     @override
     def after_backward(

@@ -7,30 +7,34 @@ moves while it exposes are moved alike.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, Annotated, ClassVar, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from pydantic import Field
 from typing_extensions import override
 
 from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.cameras.motion import rotation_matrix
 from drgs.config.extensions import EFFECTS
-from drgs.config.schema import CamerasConfig, FitConfig
+from drgs.config.section import Count, Section
 from drgs.core.errors import UserError
-from drgs.core.files import atomic_path
+from drgs.core.files import write_json
 from drgs.core.types import Array3f, Float
-from drgs.datasets.types import Dataset, View
-from drgs.results.files import CAMERAS
-from drgs.results.refined_cameras import LensChange, cameras_json
-from drgs.training.effects.base import FitState, TrainingView
-from drgs.training.effects.view_parameters import OptimisedEffect
-from drgs.training.findings import Finding, ShortFit
+from drgs.datasets.camera_file import cameras_json
+from drgs.effects.base import Finding, ShortFit, SimulatedEffect, entries, join_parts
+from drgs.effects.optimised import OptimisedEffect
+
+if TYPE_CHECKING:
+    from drgs.config.schema import FitConfig
+    from drgs.datasets.types import Dataset, View
+    from drgs.training.views import FitState, TrainingView
+
+CAMERAS = "cameras.json"  # refined cameras of the training views
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
@@ -38,6 +42,66 @@ MIN_SHIFT_PX = 0.35  # RMS, of photographs in a short fit; without wrong poses: 
 SHORT_FIT_RATE = 1e-3  # of poses, which a short fit moves fewer times
 
 MAX_FOCAL_FACTOR = 1000  # up or down
+
+
+CameraRate = Annotated[float, Field(le=1)]  # radians, scene extents, log focal lengths, image sizes
+
+
+class CamerasConfig(Section):
+    """Refinement of the training cameras; rates, for 30,000 iterations, decay as the means'.
+
+    A pose has one step per use of its image: 70 in 7,000 iterations of 100 images.
+    """
+
+    scaled: ClassVar = ("start",)
+
+    optimise: bool = Field(False, description="Refine poses, focal lengths and principal points.")
+    start: Count = Field(0, ge=0, description="Last iteration before it begins.")
+    rotation_lr: CameraRate = Field(3e-4, ge=0, description="Initial rate of rotations, radians.")
+    translation_lr: CameraRate = Field(
+        3e-4, ge=0, description="Initial rate of translations, scene extents."
+    )
+    focal_lr: CameraRate = Field(
+        0.0, ge=0, description="Initial relative rate of the focal lengths, shared by all views."
+    )
+    principal_lr: CameraRate = Field(
+        0.0,
+        ge=0,
+        description="Initial rate of the principal point, image sizes, shared by all views.",
+    )
+
+    @property
+    @override
+    def is_off(self) -> bool:
+        return not self.optimise
+
+    @override
+    def check(self, config: FitConfig) -> None:
+        """Refuse colours that are not differentiated in the camera."""
+        if self.optimise and config.model.sh_direction != "mean":
+            raise ValueError(
+                "model.sh_direction must be mean where cameras.optimise is true (colours along "
+                "rays are not differentiated in the camera), got "
+                f"{config.model.sh_direction}"
+            )
+
+
+@dataclass(frozen=True)
+class LensChange:
+    """A refinement of the lens shared by all cameras."""
+
+    focal: tuple[float, float] = (1.0, 1.0)  # factors of fx and fy
+    principal: tuple[float, float] = (0.0, 0.0)  # shift in image widths and heights
+
+    def apply(self, view: View) -> View:
+        """Return the view with this lens."""
+        return replace(
+            view,
+            fx=view.fx * self.focal[0],
+            fy=view.fy * self.focal[1],
+            cx=view.cx + self.principal[0] * view.width,
+            cy=view.cy + self.principal[1] * view.height,
+        )
 
 
 @dataclass(frozen=True)
@@ -50,17 +114,32 @@ class _Start:
     size: mi.Vector2f  # px
 
 
-@EFFECTS.register("cameras")
+@EFFECTS.register("cameras", section=CamerasConfig)
 class CameraRefinement(OptimisedEffect):
     """Poses of all training views, and their lens."""
 
-    name = "cameras"
+    order = 60  # places the sensor that is rendered, with derivatives
     moves_sensors = True
+    files = (CAMERAS,)
 
     @classmethod
     @override
-    def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> CameraRefinement:
-        return cls(config.cameras, len(dataset.train), dataset.extent)
+    def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
+        rates = config.section("cameras", CamerasConfig)
+        what = join_parts(
+            "poses" if rates.rotation_lr or rates.translation_lr else None,
+            "focal lengths" if rates.focal_lr else None,
+            "principal point" if rates.principal_lr else None,
+        )
+        what = (what or "nothing: all rates are 0") if rates.optimise else None
+        return [SimulatedEffect("camera refinement", what, "cameras.optimise")]
+
+    @classmethod
+    @override
+    def from_config(
+        cls, config: FitConfig, dataset: Dataset, section: CamerasConfig
+    ) -> CameraRefinement:
+        return cls(section, len(dataset.train), dataset.extent)
 
     @classmethod
     @override
@@ -147,16 +226,16 @@ class CameraRefinement(OptimisedEffect):
     @staticmethod
     def _camera(start: _Start, leaves: Mapping[str, Float]) -> dict[str, dr.ArrayBase]:
         """Return the sensor's parameters, from the numbers that are optimised."""
-        turn, move = (mi.Vector3f(*_entries(leaves[name])) for name in ("turns", "moves"))
+        turn, move = (mi.Vector3f(*entries(leaves[name])) for name in ("turns", "moves"))
         rotation = rotation_matrix(cast(Array3f, turn))
         rows = [[rotation[i, j] for j in range(3)] + [move[i]] for i in range(3)]
         moved = start.to_world @ mi.Matrix4f([*rows, [0, 0, 0, 1]])
         fx, fy, cx, cy = start.intrinsics
         if "log_focals" in leaves:
-            wide, tall = map(dr.exp, _entries(leaves["log_focals"]))
+            wide, tall = map(dr.exp, entries(leaves["log_focals"]))
             fx, fy = fx * wide, fy * tall
         if "shifts" in leaves:
-            right, down = _entries(leaves["shifts"])
+            right, down = entries(leaves["shifts"])
             cx, cy = cx + right * start.size.x, cy + down * start.size.y
         signs = mi.Matrix4f(OPENCV_TO_MITSUBA.astype(np.float32))
         poses = {"to_world": moved @ signs}
@@ -209,8 +288,7 @@ class CameraRefinement(OptimisedEffect):
         """Write ``cameras.json``: the refined training cameras, as ``transforms.json`` has them."""
         cameras = cameras_json(self.refined_views(dataset.train), dataset.origin)
         content = {"lens_change": asdict(self.lens_change), **cameras}
-        with atomic_path(folder / CAMERAS) as temporary:
-            temporary.write_text(json.dumps(content, indent=1) + "\n")
+        write_json(folder / CAMERAS, content)
 
 
 def _set_sensor(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:
@@ -233,8 +311,3 @@ def _transform(to_world: dr.ArrayBase) -> mi.AffineTransform4f:
 def _pose(to_world: dr.ArrayBase) -> np.ndarray:
     """Return a pose (4, 4) float64, OpenCV axes."""
     return np.array(to_world)[..., 0].astype(np.float64) @ OPENCV_TO_MITSUBA
-
-
-def _entries(values: Float) -> list[mi.Float]:
-    """Return each number as an array of one."""
-    return [dr.gather(mi.Float, values, mi.UInt32(k)) for k in range(dr.width(values))]

@@ -13,27 +13,31 @@ camera has none. The background behind a transparent photograph is unchanged.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
-from drgs.config.schema import ColorConfig, FitConfig
 from drgs.core.errors import UserError
-from drgs.core.files import atomic_path
+from drgs.core.files import write_json
 from drgs.core.types import Float, TensorXf
-from drgs.datasets.types import Dataset, View
-from drgs.results.files import PHOTOMETRY
-from drgs.training.effects.base import FitState, TrainingView, as_tensor, opacity_of
-from drgs.training.effects.view_parameters import CenteredEffect
+from drgs.effects.base import SimulatedEffect, as_tensor, entries, opacity_of
+from drgs.effects.colors import ColorConfig
+from drgs.effects.optimised import CenteredEffect
+
+if TYPE_CHECKING:
+    from drgs.config.schema import FitConfig
+    from drgs.datasets.types import Dataset, View
+    from drgs.training.views import FitState, TrainingView
 
 DARKEST = 1e-3  # of colours that f maps; below, and above 1, it is linear
+
+PHOTOMETRY = "photometry.json"  # vignetting and response of the training views' cameras
 
 COEFFICIENTS = {"vignetting": 3, "response": 2}
 
@@ -42,13 +46,20 @@ COEFFICIENTS = {"vignetting": 3, "response": 2}
 class Photometry(CenteredEffect):
     """Coefficients of vignetting and response, a row for each camera."""
 
-    name, centered = "photometry", "response"
+    order, centered = 20, "response"
     upload_bytes = 24
+    files = (PHOTOMETRY,)
+
+    @classmethod
+    @override
+    def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
+        names = given_rates(config.section("colors", ColorConfig))
+        return [SimulatedEffect(n, "of each camera", f"colors.{n}_lr") for n in names]
 
     @classmethod
     @override
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> Photometry:
-        return cls(config.colors, dataset.train)
+        return cls(config.section("colors", ColorConfig), dataset.train)
 
     def __init__(self, config: ColorConfig, views: Sequence[View]) -> None:
         """views: the training split."""
@@ -60,8 +71,7 @@ class Photometry(CenteredEffect):
                 "colors.response_lr: needs photographs by several cameras, whose size, intrinsics "
                 "or lens differ, got those of one; leave it out"
             )
-        given = {"vignetting": config.vignetting_lr, "response": config.response_lr}
-        rates = {name: rate for name, rate in given.items() if rate is not None}
+        rates = given_rates(config)
         super().__init__({n: np.zeros((len(rows), COEFFICIENTS[n])) for n in rates}, rates)
         self.attached: dict[int, dict[str, Float]] = {}  # by view, which may share a camera
 
@@ -88,11 +98,11 @@ class Photometry(CenteredEffect):
         numbers, (r2, opaque) = self.attached[view.index], view.uploads[self.name]
         values = image.array
         if "vignetting" in numbers:
-            a, b, c = _entries(numbers["vignetting"])
+            a, b, c = entries(numbers["vignetting"])
             s = r2.array
             values = values * (1 + s * (a + b * (2 * s - 1) + c * (6 * s * (s - 1) + 1)))
         if "response" in numbers:
-            p, q = _entries(numbers["response"] - self.common)
+            p, q = entries(numbers["response"] - self.common)
             base = dr.clip(values, DARKEST, 1)
             values = values * dr.exp(dr.log(base) * (dr.exp(p + q * base) - 1))
         seen = type(image)(values, image.shape)
@@ -121,8 +131,7 @@ class Photometry(CenteredEffect):
             view.name: {name: values[row].tolist() for name, values in found.items()}
             for view, row in zip(dataset.train, self.camera_rows, strict=True)
         }
-        with atomic_path(folder / PHOTOMETRY) as temporary:
-            temporary.write_text(json.dumps(by_view, indent=1) + "\n")
+        write_json(folder / PHOTOMETRY, by_view)
 
     @override
     def _optimizers_of(self, view: TrainingView) -> dict[str, Adam]:
@@ -130,12 +139,13 @@ class Photometry(CenteredEffect):
         return {name: optimizers[row] for name, optimizers in self.optimizers.items()}
 
 
+def given_rates(config: ColorConfig) -> dict[str, float]:
+    """Return the rates of the coefficients that a fit has."""
+    rates = {"vignetting": config.vignetting_lr, "response": config.response_lr}
+    return {name: rate for name, rate in rates.items() if rate is not None}
+
+
 def _camera_key(view: View) -> tuple[object, ...]:
     """Return a key that is the same for photographs by the same camera."""
     size = view.width, view.height
     return *size, view.fx, view.fy, view.cx, view.cy, repr(view.lens)
-
-
-def _entries(values: Float) -> list[Float]:
-    """Return the entries as arrays of one, that are not compiled into the kernel."""
-    return [dr.gather(mi.Float, values, mi.UInt32(k)) for k in range(len(values))]

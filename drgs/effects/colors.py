@@ -8,25 +8,29 @@ compensation" has neither constraint.) The background behind a transparent photo
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import drjit as dr
 import numpy as np
+from PIL import ExifTags, Image
+from pydantic import Field
 from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
-from drgs.config.schema import ColorConfig, FitConfig
+from drgs.config.section import Rate, Section, Weight
 from drgs.core.arrays import image_of, planes_of, types_of
-from drgs.core.files import atomic_path
+from drgs.core.files import write_json
 from drgs.core.types import Float, TensorXf
-from drgs.datasets.types import Dataset, View
-from drgs.results.files import COLORS
-from drgs.training.effects.base import FitState, TrainingView, as_numbers, opacity_of
-from drgs.training.effects.view_parameters import CenteredEffect
-from drgs.training.findings import Finding, ShortFit, exposure_spread
+from drgs.effects.base import Finding, ShortFit, SimulatedEffect, as_numbers, opacity_of
+from drgs.effects.optimised import CenteredEffect
+
+if TYPE_CHECKING:
+    from drgs.config.schema import FitConfig
+    from drgs.datasets.types import Dataset, View
+    from drgs.training.views import FitState, TrainingView
 
 EXAMINED_LR = 0.02  # of the transforms where an examination chooses them
 
@@ -36,20 +40,63 @@ short fit is worth its time: about twice those of renderings and photographs wit
 
 MIN_STOPS = 0.1  # the same, of the exposures that EXIF gives
 
+COLORS = "colors.json"  # transforms of the training views
+
 IDENTITY = np.eye(3, 4).reshape(1, 12)  # the identity, row by row
 
 
-@EFFECTS.register("colors")
+class ColorConfig(Section):
+    """Exposure and white balance of each training photograph, and each camera's vignetting."""
+
+    lr: Rate | None = Field(
+        None,
+        gt=0,
+        description="Initial rate of the 3 x 4 numbers of each transform, such as 0.02; decays as "
+        "the rate of the means. null: no transforms.",
+    )
+    identity_weight: Weight = Field(
+        1.0, description="Weight of the mean squared difference from the identity."
+    )
+    vignetting_lr: Rate | None = Field(
+        None,
+        gt=0,
+        description="Initial rate of the three coefficients of each camera's vignetting, such as "
+        "0.03. null: no vignetting.",
+    )
+    response_lr: Rate | None = Field(
+        None,
+        gt=0,
+        description="Initial rate of the two numbers by which each camera's response differs from "
+        "the mean of all, such as 0.005. null: the same response.",
+    )
+
+    @property
+    @override
+    def is_off(self) -> bool:
+        return (self.lr, self.vignetting_lr, self.response_lr) == (None, None, None)
+
+
+@EFFECTS.register("colors", section=ColorConfig)
 class ColorCorrection(CenteredEffect):
     """A 3 x 4 transform for each view."""
 
-    name, centered = "colors", "matrices"
+    order, centered = 10, "matrices"
     upload_bytes = 12
+    files = (COLORS,)
 
     @classmethod
     @override
-    def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> ColorCorrection:
-        return cls(config.colors, len(dataset.train))
+    def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
+        is_used = config.section("colors", ColorConfig).lr is not None
+        what = "a colour transform for each training photograph" if is_used else None
+        return [SimulatedEffect("exposure and white balance", what, "colors.lr")]
+
+    @classmethod
+    @override
+    def from_config(
+        cls, config: FitConfig, dataset: Dataset, section: ColorConfig
+    ) -> ColorCorrection:
+        return cls(section, len(dataset.train))
 
     @classmethod
     @override
@@ -117,9 +164,30 @@ class ColorCorrection(CenteredEffect):
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write ``colors.json``: the transform of each training view, 3 x 4, by name."""
         pairs = zip(dataset.train, self.transforms(), strict=True)
-        by_view = {view.name: matrix.tolist() for view, matrix in pairs}
-        with atomic_path(folder / COLORS) as temporary:
-            temporary.write_text(json.dumps(by_view, indent=1) + "\n")
+        write_json(folder / COLORS, {view.name: matrix.tolist() for view, matrix in pairs})
+
+
+def exposure_spread(paths: Sequence[Path]) -> float | None:
+    """Return the standard deviation of the exposures that EXIF gives, in stops.
+
+    An exposure is time x sensitivity / aperture^2; None if a photograph does not give all three.
+    """
+    exposures = [_exposure_of(path) for path in paths]
+    known = [exposure for exposure in exposures if exposure is not None]
+    return float(np.std(np.log2(known))) if known and len(known) == len(exposures) else None
+
+
+def _exposure_of(path: Path) -> float | None:
+    tags = ExifTags.Base
+    try:
+        with warnings.catch_warnings(), Image.open(path) as image:
+            warnings.simplefilter("ignore")
+            details = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        time, aperture = float(details[tags.ExposureTime]), float(details[tags.FNumber])
+        product = time * float(details[tags.ISOSpeedRatings]) / aperture**2
+    except Exception:  # Pillow raises many types for broken EXIF, which is ignored
+        return None
+    return product if 0 < product < float("inf") else None
 
 
 def transform_colors(image: TensorXf, matrix: TensorXf) -> TensorXf:

@@ -7,18 +7,22 @@ Dr.Jit differentiates a gather by adding atomically, in an order that no two run
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import cast
+from dataclasses import replace
+from typing import TYPE_CHECKING, cast
 
 import drjit as dr
 import numpy as np
 from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
-from drgs.config.schema import FitConfig
 from drgs.core.arrays import image_of, planes_of
 from drgs.core.types import Float, TensorXf
-from drgs.datasets.types import Dataset, View
-from drgs.training.effects.base import TrainingEffect, TrainingView, as_numbers
+from drgs.effects.base import SimulatedEffect, TrainingEffect, as_numbers
+
+if TYPE_CHECKING:
+    from drgs.config.schema import FitConfig
+    from drgs.datasets.types import Dataset, View
+    from drgs.training.views import TrainingView
 
 
 @EFFECTS.register("depth")
@@ -29,9 +33,17 @@ class DepthSupervision(TrainingEffect):
     and not masked, D being the alpha-weighted sum of the splats' depths and A the alpha.
     """
 
-    name = "depth"
+    order = -10  # the others get the colours only
     aovs = "depth:depth, alpha:alpha"
     upload_bytes = 8
+
+    @classmethod
+    @override
+    def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
+        depths = [view.depth for view in dataset.train]
+        effect = SimulatedEffect.from_data("depth", depths, "supervision")
+        effect = effect.unless_ignored(config.loss.depth_weight == 0)
+        return [replace(effect, ignored=effect.ignored or "depth" in dataset.ignored)]
 
     @classmethod
     @override

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import numpy as np
 from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
 from drgs.core.types import TensorXf
-from drgs.datasets.types import View
-from drgs.training.effects.base import TrainingEffect, TrainingView, as_tensor
+from drgs.effects.base import SimulatedEffect, TrainingEffect, as_tensor
+
+if TYPE_CHECKING:
+    from drgs.config.schema import FitConfig
+    from drgs.datasets.types import Dataset, View
+    from drgs.training.views import TrainingView
 
 
 @EFFECTS.register("masks")
@@ -18,8 +25,15 @@ class Masks(TrainingEffect):
     They have no derivative. SSIM's windows that reach into them see the same black in both.
     """
 
-    name = "masks"
+    order = 40
     upload_bytes = 12
+
+    @classmethod
+    @override
+    def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
+        masks = [view.mask for view in dataset.train]
+        effect = SimulatedEffect.from_data("masks", masks, "pixels left out")
+        return [replace(effect, ignored="masks" in dataset.ignored)]
 
     @override
     def upload(self, view: View) -> TensorXf | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -11,9 +11,12 @@ import numpy as np
 from drjit.opt import Adam
 from typing_extensions import override
 
+from drgs.core.adam import make_optimizer, optimizer_state, restore_optimizer
 from drgs.core.types import Float
-from drgs.training.effects.base import TrainingEffect, TrainingView, as_numbers
-from drgs.training.optimizer import make_optimizer, optimizer_state, restore_optimizer
+from drgs.effects.base import TrainingEffect, as_numbers
+
+if TYPE_CHECKING:
+    from drgs.training.views import TrainingView
 
 
 class OptimisedEffect(TrainingEffect):

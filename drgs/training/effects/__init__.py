@@ -1,4 +1,0 @@
-"""Effects of a fit, each imported when it is used.
-
-May import what ``training`` may, but nothing of the trainer.
-"""
