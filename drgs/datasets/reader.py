@@ -275,10 +275,7 @@ def _focal(frame: TransformsFrame, axis: str, side: int) -> float:
 
 
 def _read_images(
-    config: DataConfig,
-    frame: TransformsFrame,
-    pixels: np.ndarray,
-    store: MemoryStore,
+    config: DataConfig, frame: TransformsFrame, pixels: np.ndarray, store: MemoryStore
 ) -> Images:
     files, stored, depth = frame.files, (pixels.shape[1], pixels.shape[0]), None
     image, alpha = compact_photograph(pixels, config.background_rgb, config.image_size, store)

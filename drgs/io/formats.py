@@ -208,11 +208,7 @@ def _check_arrays(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
 
 
 def check_range(
-    where: str | Path,
-    name: str,
-    values: np.ndarray,
-    least: float = -np.inf,
-    most: float = np.inf,
+    where: str | Path, name: str, values: np.ndarray, least: float = -np.inf, most: float = np.inf
 ) -> None:
     """Raise :class:`UserError` for a value (N, ...) that is not finite, or out of range.
 

@@ -334,11 +334,7 @@ class _Document:
         return self._item("accessors", self.file.accessors, index, _Accessor)
 
     def values(
-        self,
-        name: str,
-        width: int,
-        least: float = -np.inf,
-        most: float = np.inf,
+        self, name: str, width: int, least: float = -np.inf, most: float = np.inf
     ) -> np.ndarray:
         """Return an attribute (N, width) float64 of finite numbers from ``least`` to ``most``."""
         accessor = self.accessor(name)

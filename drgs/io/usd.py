@@ -26,16 +26,7 @@ from drgs.core.errors import UserError, UserNote, one_line
 from drgs.core.files import refuse_damage
 from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD
-from drgs.io.formats import (
-    FORMATS,
-    ORIGIN,
-    UP,
-    Arrays,
-    FileFormat,
-    Scalar,
-    check_range,
-    pop_origin,
-)
+from drgs.io.formats import FORMATS, ORIGIN, UP, Arrays, FileFormat, Scalar, check_range, pop_origin
 from drgs.io.quantization import (
     log_scales_from_scales,
     logits_from_opacities,
