@@ -25,6 +25,7 @@ from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, UserNote, format_names, one_line
 from drgs.core.folders import digest
 from drgs.datasets.images import (
+    MemoryStore,
     Pixels,
     can_shift,
     choose_store,
@@ -41,7 +42,6 @@ from drgs.datasets.images import (
     unread_image,
 )
 from drgs.datasets.splits import Lists, split_of
-from drgs.datasets.storage import MemoryStore
 from drgs.datasets.transforms import (
     CLOSE_POSE_KEY,
     TransformsFrame,

@@ -240,7 +240,8 @@ def read_transforms(path: Path) -> TransformsFile:
     """
     text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
     meta = validate(Transforms, parse_json(text, f"{path}: "), f"{path}: ")
-    top = {name: getattr(meta, name) for name in CameraValues.model_fields} | _extra(meta)
+    top = {name: getattr(meta, name) for name in CameraValues.model_fields}
+    top |= meta.model_extra or {}
     frames = []
     for index, frame in enumerate(meta.frames):
         inherited = {key: value for key, value in top.items() if getattr(frame, key, None) is None}
@@ -256,16 +257,12 @@ def note_unread(path: Path, keys: Sequence[str]) -> str:
     return f"{path}: keys that are not read: {format_names(keys, 8)}"
 
 
-def _extra(values: CameraValues) -> dict[str, object]:
-    return values.model_extra or {}
-
-
 def _unread_keys(meta: Transforms) -> list[str]:
     """Return sorted keys; those of frames as ``frames[].key``."""
     models = {values.camera_model for values in (meta, *meta.frames)}
     known = IGNORED_KEYS.union(*map(_coefficient_names, models))
-    top = _extra(meta).keys() - known
-    in_frames = set().union(*map(_extra, meta.frames)) - known
+    top = (meta.model_extra or {}).keys() - known
+    in_frames = set().union(*(frame.model_extra or {} for frame in meta.frames)) - known
     keys = [*sorted(top), *(f"frames[].{key}" for key in sorted(in_frames))]
     return [one_line(key, 60) for key in keys]
 

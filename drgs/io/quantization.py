@@ -68,6 +68,23 @@ def sh0_from_colors(colors: np.ndarray) -> np.ndarray:
     return ((colors - 0.5) / SH_C0)[:, None, :]
 
 
+def arrays_from_activated(
+    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the arrays of :data:`drgs.io.formats.Arrays` from values as they are seen.
+
+    quats: (N, 4) wxyz; scales: (N, 3) standard deviations; opacities: (N,); sh: (N, K, 3).
+    """
+    return {
+        "means": means,
+        "quats": quats,
+        "log_scales": log_scales_from_scales(scales),
+        "logit_opacities": logits_from_opacities(opacities),
+        "sh0": sh[:, :1],
+        "shN": sh[:, 1:],
+    }
+
+
 def normalize_quaternions(quats: np.ndarray) -> np.ndarray:
     """Return quaternions (N, 4) wxyz, float64, of length 1; one of length 0 is the identity."""
     quats = quats.astype(np.float64)

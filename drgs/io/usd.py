@@ -28,8 +28,7 @@ from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD
 from drgs.io.formats import FORMATS, ORIGIN, UP, Arrays, FileFormat, Scalar, check_range, pop_origin
 from drgs.io.quantization import (
-    log_scales_from_scales,
-    logits_from_opacities,
+    arrays_from_activated,
     normalize_quaternions,
     opacities_from_logits,
     require_scene_memory,
@@ -138,14 +137,8 @@ def _read_stage(
         )
     require_scene_memory(path, num, per_gaussian, turned=True)
     harmonics = harmonics.reshape(num, per_gaussian, 3)
-    arrays = {
-        "means": means,
-        "quats": np.roll(quats_xyzw, 1, axis=1),
-        "log_scales": log_scales_from_scales(scales),
-        "logit_opacities": logits_from_opacities(opacities),
-        "sh0": harmonics[:, :1],
-        "shN": harmonics[:, 1:],
-    }
+    quats = np.roll(quats_xyzw, 1, axis=1)
+    arrays = arrays_from_activated(means, quats, scales, opacities, harmonics)
     rendered_with: dict[str, Scalar] = {UP: UsdGeom.GetStageUpAxis(stage).lower()}
     if tuple(origin) != WORLD:
         rendered_with |= zip(ORIGIN, map(float, origin), strict=True)

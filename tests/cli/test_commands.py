@@ -34,7 +34,7 @@ def command(act):
     """``main`` of a command that does nothing else."""
 
     def add_arguments(parser):
-        parser.add_argument("--size", type=bounded_int(1, 4096, "as large as anything is"))
+        parser.add_argument("--size", type=bounded_int(1, 4096))
         parser.set_defaults(run=lambda args: act())
 
     return lambda words: run_command(add_arguments, "some command", words)
@@ -100,7 +100,7 @@ def test_home_folders_are_expanded_or_refused(monkeypatch):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--size", "9" * 4000], "argument --size: must be at most 4,096 (as large as anything is"),
+        (["--size", "9" * 4000], "argument --size: must be at most 4,096, got 99"),
         (["--size", "1" * 20 + "x"], "argument --size: must be a whole number >= 1, got 111"),
         (["--sise", "a\nb"], "unrecognized arguments: --sise a b"),
     ],
