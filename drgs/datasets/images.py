@@ -12,7 +12,6 @@ import os
 import shutil
 import tempfile
 import threading
-import warnings
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -23,7 +22,7 @@ import numpy as np
 from scipy import sparse
 from typing_extensions import override
 
-from drgs.core.errors import UserError, UserNote, one_line
+from drgs.core.errors import UserError, note_user, one_line
 from drgs.core.files import open_regular, refusal_reason, refuse_damage
 from drgs.core.memory import available_memory, format_bytes, require_memory
 from drgs.datasets.types import LazyImage, Pixels, View
@@ -429,11 +428,10 @@ def choose_store(
             if needed > available:
                 raise
         else:
-            note = (
+            note_user(
                 f"{files[0].parent}: {len(files):,} photographs take {format_bytes(needed)}, and "
                 f"{format_bytes(available)} of memory are available: they are read from disk"
             )
-            warnings.warn(UserNote(note), stacklevel=2)
             return store
     if needed > available:
         raise UserError(

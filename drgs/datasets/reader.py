@@ -8,7 +8,6 @@ folder.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -22,7 +21,7 @@ from pydantic import BaseModel
 from drgs.cameras.viewpoints import panorama_intrinsics
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
-from drgs.core.errors import UserError, UserNote, format_names, one_line
+from drgs.core.errors import UserError, format_names, note_user, one_line
 from drgs.core.folders import digest
 from drgs.datasets.images import (
     MemoryStore,
@@ -367,7 +366,7 @@ class Notices:
         texts = [f"photographs {what}: {_format_files(n)}" for what, n in self._findings.items()]
         texts += self._duplicate_notes(train, test)
         for note in (*notes, *(f"{self._folder}: {text}" for text in texts)):
-            warnings.warn(UserNote(one_line(note, MAX_NOTE_CHARACTERS)), stacklevel=2)
+            note_user(one_line(note, MAX_NOTE_CHARACTERS))
 
     def _name(self, file: Path) -> str:
         is_below = file.is_relative_to(self._folder)

@@ -9,7 +9,6 @@ read as well; a prim may be moved, but not turned or scaled.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from functools import partial
 from importlib import import_module
@@ -22,7 +21,7 @@ from numpy.typing import ArrayLike
 from typing_extensions import override
 
 from drgs.core.environment import require_module
-from drgs.core.errors import UserError, UserNote, one_line
+from drgs.core.errors import UserError, note_user, one_line
 from drgs.core.files import refuse_damage
 from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD
@@ -115,7 +114,7 @@ def _read_stage(
     space = Usd.ColorSpaceAPI(prims[0]).GetColorSpaceNameAttr().Get()
     if space not in (None, "", COLOR_SPACE):
         note = f"colours of the space {one_line(space, 40)} are read as of {COLOR_SPACE}"
-        warnings.warn(UserNote(f"{place}: {note}"), stacklevel=2)
+        note_user(f"{place}: {note}")
     to_world = UsdGeom.Xformable(prims[0]).ComputeLocalToWorldTransform(time)
     origin = to_world.ExtractTranslation()
     if to_world != Gf.Matrix4d().SetTranslate(origin):
