@@ -49,14 +49,11 @@ DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 
 RATIONAL_MODEL = "FULL_OPENCV"  # the model of a camera that has k4 to k6
 
-PLANE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL_MODEL)
-FISHEYE_MODELS = (
-    *("SIMPLE_FISHEYE", "FISHEYE"),
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"),
-)
 LENS_OF_MODEL = {
-    **dict.fromkeys(PLANE_MODELS, "opencv"),
-    **dict.fromkeys(FISHEYE_MODELS, "fisheye"),
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "opencv"),
+    **dict.fromkeys(("OPENCV", RATIONAL_MODEL), "opencv"),
+    **dict.fromkeys(("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE"), "fisheye"),
+    **dict.fromkeys(("RADIAL_FISHEYE", "OPENCV_FISHEYE"), "fisheye"),
     "THIN_PRISM_FISHEYE": "thin_prism_fisheye",
     "EQUIRECTANGULAR": "equirectangular",
 }
