@@ -138,11 +138,8 @@ def test_weighted_sums_are_image_contributions_times_the_plane(precision, sh_dir
     plane = np.random.default_rng(3).uniform(0, 1, (case.height, case.width))
     expected = []
     for white in np.eye(12):
-        rendered = reference.composite(
-            splats.means2d, splats.conics, splats.opacities, np.repeat(white[:, None], 3, axis=1),
-            splats.depths, splats.visible, np.zeros(3), case.width, case.height,
-            cuts=splats.cuts,
-        )  # fmt: skip
+        colors = np.repeat(white[:, None], 3, axis=1)
+        rendered = reference.composite(splats, colors, np.zeros(3), case.width, case.height)
         expected.append(np.sum(rendered.image[..., 0] * plane))
     approximations = Approximations(sh_direction=sh_direction)
     pipeline = pipeline_of(approximations, case.rendered_degree)

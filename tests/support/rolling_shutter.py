@@ -35,11 +35,9 @@ def rolling_image(gaussians, camera_at, lens, degree, threshold_width) -> refere
     with mock.patch.object(type(lens), "slope_bounds", lambda *_: bounds):
         splats = [effects.project(*pair, lens) for pair in pairs]
     colors = np.concatenate([effects.sh_colors(*pair, lens, degree) for pair in pairs])
-    means2d, conics, opacities, depths, visible = (
-        np.concatenate([getattr(each, name) for each in splats])
-        for name in ("means2d", "conics", "opacities", "depths", "visible")
+    arrays = ("means2d", "cov2d", "conics", "depths", "opacities", "visible")
+    splats = reference.Projection(
+        *(np.concatenate([getattr(each, name) for each in splats]) for name in arrays)
     )
-    return reference.composite(
-        means2d, conics, opacities, colors, depths, visible, np.zeros(3),
-        cameras[0].width, cameras[0].height, threshold_width,
-    )  # fmt: skip
+    size = cameras[0].width, cameras[0].height
+    return reference.composite(splats, colors, np.zeros(3), *size, threshold_width)
