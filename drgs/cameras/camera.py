@@ -65,18 +65,13 @@ class Shutter(Protocol):
         """Return ``camera``, which is at time 0, at another time, without a shutter."""
         ...
 
-    def cameras(self, camera: Camera) -> list[Camera]:
-        """Return the cameras whose images are averaged."""
-        ...
-
-    def with_samples(self, samples: int) -> Shutter:
-        """Return the shutter with another number of times, if it has one."""
-        del samples
-        return self
+    def cameras(self, camera: Camera, samples: int | None) -> list[Camera]:
+        """Return the cameras whose images are averaged; samples: their number, None: its own."""
+        return [camera]
 
     def camera_of(self, means: Array3f, camera: Camera) -> Camera:
         """Return the camera that sees each of some means (world)."""
-        ...
+        raise ValueError("a camera that motion blurs has an image for each of its cameras_in_time")
 
 
 @dataclass(frozen=True)
@@ -221,7 +216,4 @@ def cameras_in_time(camera: Camera, samples: int | None = None) -> list[Camera]:
 
     samples: number of times of a shutter that is open; None: its own.
     """
-    shutter = camera.shutter
-    if shutter is None:
-        return [camera]
-    return (shutter if samples is None else shutter.with_samples(samples)).cameras(camera)
+    return [camera] if camera.shutter is None else camera.shutter.cameras(camera, samples)

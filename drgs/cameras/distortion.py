@@ -7,13 +7,13 @@ scalars.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Protocol
 
 import drjit as dr
 import numpy as np
 
-from drgs.cameras.lens import check_coefficients
+from drgs.cameras.lens import Lens, check_coefficients
 from drgs.core.arrays import types_of
 from drgs.core.types import Bool, Float, Scalar, UInt32
 
@@ -96,24 +96,19 @@ def _bracket_middle(low: Scalar, high: Float) -> Float:
     return middle / (1 - middle)
 
 
-def usable_coefficients(given: Mapping[str, float]) -> dict[str, float]:
-    """Return the same coefficients with 0 for negligible ones.
+def grouped_coefficients(
+    lens: type[Lens], given: Mapping[str, float]
+) -> Iterator[tuple[float, ...]]:
+    """Yield the fields of ``Lens.groups``: polynomials to their last term, other groups whole.
 
-    Raises :class:`UserError` naming the first that is larger than ``MAX_COEFFICIENT``.
+    Missing and negligible coefficients are zero. A group of which none is given is empty.
     """
     check_coefficients(given)
-    return {n: v if abs(v) >= NEGLIGIBLE_COEFFICIENT else 0.0 for n, v in given.items()}
-
-
-def trim_zeros(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
-    """Return coefficients of a polynomial: zero where one is not given but a later one is."""
-    count = max((n for n, name in enumerate(names, 1) if name in given), default=0)
-    return tuple(float(given.get(name, 0.0)) for name in names[:count])
-
-
-def check_pair(names: Sequence[str], given: Mapping[str, float]) -> tuple[float, ...]:
-    """Return coefficients if one is given, zero for another that is not."""
-    return tuple(float(given.get(name, 0.0)) for name in names if set(names) & set(given))
+    kept = {n: float(v) for n, v in given.items() if abs(v) >= NEGLIGIBLE_COEFFICIENT}
+    for names in lens.groups.values():
+        last = max((n for n, name in enumerate(names, 1) if name in given), default=0)
+        count = last if names[0].startswith("k") else bool(last) * len(names)
+        yield tuple(kept.get(name, 0.0) for name in names[:count])
 
 
 class PlaneDistortion(Protocol):
@@ -210,15 +205,15 @@ class PlaneDistortion(Protocol):
         return x * x + y * y < self.squared_limit()
 
 
-def steepest_fall(tangential: Sequence[float], prism: Sequence[float] = (0.0, 0.0)) -> float:
+def steepest_fall(tangential: Sequence[float], prism: Sequence[float] = ()) -> float:
     """Return c >= 0, where -c r is the least eigenvalue of the other terms at radius r.
 
-    That is of the symmetric part of their Jacobian, in any direction. tangential: p1, p2; prism:
-    sx1, sy1, of terms sx1 r^2 in x' and sy1 r^2 in y'. At w = (x, y), with p = (p2, p1)
-    and s = (sx1, sy1), all of them are r^2 (p + s) + 2 (p . w) w, the symmetric part is
-    q w^T + w q^T + 2 (p . w) I with q = 2 p + s, and its least eigenvalue (4 p + s) . w - r |q|.
+    That is of the symmetric part of their Jacobian, in any direction. tangential: p1, p2 or none;
+    prism: sx1, sy1 or none, of terms sx1 r^2 in x' and sy1 r^2 in y'. At w = (x, y), with
+    p = (p2, p1) and s = (sx1, sy1), all of them are r^2 (p + s) + 2 (p . w) w, the symmetric part
+    is q w^T + w q^T + 2 (p . w) I with q = 2 p + s, its least eigenvalue (4 p + s) . w - r |q|.
     """
-    p, s = np.array(tangential)[::-1], np.array(prism)
+    p, s = (np.array(pair or (0.0, 0.0)) for pair in (tangential[::-1], prism))
     return math.hypot(*(4 * p + s)) + math.hypot(*(2 * p + s))
 
 

@@ -17,11 +17,10 @@ from typing_extensions import override
 from drgs.cameras.distortion import (
     derivative,
     first_root,
+    grouped_coefficients,
     horner,
     polynomial,
     radius_at,
-    trim_zeros,
-    usable_coefficients,
 )
 from drgs.cameras.lens import LENSES, CameraParameters, Lens, film_coordinates, pixel_coordinates
 from drgs.core.arrays import is_float64, types_of
@@ -58,7 +57,7 @@ class Fisheye(Lens):
     @override
     def from_coefficients(cls, **coefficients: float) -> Fisheye:
         """Return the lens with OpenCV's ``k1`` to ``k4``; missing ones are zero."""
-        terms = trim_zeros(cls.groups["radial_terms"], usable_coefficients(coefficients))
+        (terms,) = grouped_coefficients(cls, coefficients)
         growth = [1.0, *((2 * n + 3) * k for n, k in enumerate(terms))]
         turn = math.sqrt(first_root(np.array(growth)))
         return cls(terms, math.cos(min(turn, MAX_ANGLE)))

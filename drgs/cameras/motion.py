@@ -68,17 +68,10 @@ class MotionBlur(Motion):
     samples: int
 
     @override
-    def cameras(self, camera: Camera) -> list[Camera]:
+    def cameras(self, camera: Camera, samples: int | None) -> list[Camera]:
+        count = samples or self.samples
         # In the middle of equal intervals of time.
-        return [self.pose(camera, (k + 0.5) / self.samples) for k in range(self.samples)]
-
-    @override
-    def with_samples(self, samples: int) -> MotionBlur:
-        return replace(self, samples=samples)
-
-    @override
-    def camera_of(self, means: Array3f, camera: Camera) -> Camera:
-        raise ValueError("a camera that motion blurs has an image for each of its cameras_in_time")
+        return [self.pose(camera, (k + 0.5) / count) for k in range(count)]
 
 
 @dataclass(frozen=True)
@@ -86,10 +79,6 @@ class RollingShutter(Motion):
     """The film's rows are read from the first, at time 0, to the last, at time 1."""
 
     label: ClassVar[str] = "rolling shutter"
-
-    @override
-    def cameras(self, camera: Camera) -> list[Camera]:
-        return [camera]
 
     @override
     def camera_of(self, means: Array3f, camera: Camera) -> Camera:

@@ -19,13 +19,11 @@ from typing_extensions import override
 from drgs.cameras.distortion import (
     UNBOUNDED_SLOPE,
     PlaneDistortion,
-    check_pair,
     derivative,
+    grouped_coefficients,
     largest_squared_radius,
     polynomial,
     steepest_fall,
-    trim_zeros,
-    usable_coefficients,
 )
 from drgs.cameras.lens import (
     LENSES,
@@ -74,13 +72,9 @@ class RadialTangential(PlaneDistortion, Perspective):
     @override
     def from_coefficients(cls, **coefficients: float) -> RadialTangential:
         """Return the lens with OpenCV's ``k1`` to ``k6``, ``p1``, ``p2``; others are zero."""
-        given = usable_coefficients(coefficients)
-        numerator = trim_zeros(cls.groups["numerator"], given)
-        denominator = trim_zeros(cls.groups["denominator"], given)
-        tangential = check_pair(cls.groups["tangential"], given)
-        fall = steepest_fall(tangential or (0.0, 0.0))
-        radius = largest_squared_radius(numerator, denominator, fall)
-        return cls(numerator, denominator, tangential, radius)
+        numerator, denominator, tangential = grouped_coefficients(cls, coefficients)
+        limit = largest_squared_radius(numerator, denominator, steepest_fall(tangential))
+        return cls(numerator, denominator, tangential, limit)
 
     @override
     def squared_limit(self) -> Scalar:

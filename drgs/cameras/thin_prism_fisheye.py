@@ -15,13 +15,11 @@ from typing_extensions import override
 
 from drgs.cameras.distortion import (
     PlaneDistortion,
-    check_pair,
     derivative,
+    grouped_coefficients,
     largest_squared_radius,
     polynomial,
     steepest_fall,
-    trim_zeros,
-    usable_coefficients,
 )
 from drgs.cameras.fisheye import MAX_ANGLE, Fisheye, place_directions, place_of
 from drgs.cameras.lens import LENSES, CameraParameters, film_coordinates, pixel_coordinates
@@ -58,12 +56,9 @@ class ThinPrismFisheye(PlaneDistortion, Fisheye):
     @override
     def from_coefficients(cls, **coefficients: float) -> ThinPrismFisheye:
         """Return the lens with COLMAP's coefficients; missing ones are zero."""
-        given, (radial, *pairs) = usable_coefficients(coefficients), cls.groups.values()
-        kept = trim_zeros(radial, given)
-        tangential, prism = (check_pair(names, given) for names in pairs)
-        fall = steepest_fall(tangential or (0.0, 0.0), prism or (0.0, 0.0))
-        angle = min(math.sqrt(largest_squared_radius(kept, (), fall)), MAX_ANGLE)
-        return cls(kept, math.cos(angle), tangential, prism)
+        radial, tangential, prism = grouped_coefficients(cls, coefficients)
+        limit = largest_squared_radius(radial, (), steepest_fall(tangential, prism))
+        return cls(radial, math.cos(min(math.sqrt(limit), MAX_ANGLE)), tangential, prism)
 
     @override
     def squared_limit(self) -> Scalar:

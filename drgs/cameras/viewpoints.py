@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Self
 
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import UserError
@@ -67,7 +68,7 @@ class Viewpoint:
         viewmat[:3] = np.column_stack([rotation, -rotation @ self.center])
         return viewmat
 
-    def with_offset(self: V, offset: np.ndarray) -> V:
+    def with_offset(self, offset: np.ndarray) -> Self:
         """Return the same camera with ``offset`` (3,) added to its position."""
         if not np.any(offset):
             return self
@@ -75,9 +76,6 @@ class Viewpoint:
         if motion is not None:
             motion = replace(motion, close_to_world=_translate_pose(motion.close_to_world, offset))
         return replace(self, camera_to_world=pose, motion=motion)
-
-
-V = TypeVar("V", bound=Viewpoint)
 
 
 def _translate_pose(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:

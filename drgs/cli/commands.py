@@ -113,9 +113,9 @@ def run_command(
     with the whole line as ``command``, and ``is_shared`` if several processes may run it together.
     prog: the command's name. arguments: its words; None: those of this process.
     """
+    escape_unencodable()
     with (
         end_job_on_error(),
-        escape_unencodable(),
         exit_on_interrupt(),
         exit_on_user_error(),
         root_output_only(),
@@ -136,8 +136,8 @@ def run_command(
             args.run(args)
 
 
-def bounded_int(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Callable[[str], int]:
-    """Return a parser of whole numbers from ``minimum`` to ``maximum``; reason: for ``maximum``."""
+def bounded_int(minimum: int, maximum: int = MAX_INT) -> Callable[[str], int]:
+    """Return a parser of whole numbers from ``minimum`` to ``maximum``."""
 
     def whole_number(text: str) -> int:
         # Python converts no more than 4,300 digits.
@@ -146,7 +146,7 @@ def bounded_int(minimum: int, maximum: int = MAX_INT, reason: str = "") -> Calla
             return number
         expected = f"a whole number >= {minimum}"
         if number is not None and number > maximum:
-            expected = f"at most {maximum:,}" + (f" ({reason})" if reason else "")
+            expected = f"at most {maximum:,}"
         got = one_line(text, 80) or "nothing"
         raise argparse.ArgumentTypeError(f"must be {expected}, got {got}")
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from types import FrameType
-from typing import TextIO
+from typing import Any
 
 from drgs.core.errors import UserError, UserNote
 from drgs.core.files import refusal_reason
@@ -154,19 +154,11 @@ def _interrupt_after(error: BaseException | None) -> KeyboardInterrupt | None:
     return None
 
 
-@contextmanager
-def escape_unencodable() -> Iterator[None]:
-    """Escape, within the block, characters that the standard streams' encoding lacks."""
-    streams = [s for s in (sys.stdout, sys.stderr) if isinstance(s, TextIOWrapper)]
-    before = [stream.errors for stream in streams]
-    for stream in streams:
-        stream.reconfigure(errors="backslashreplace")
-    try:
-        yield
-    finally:
-        for stream, errors in zip(streams, before, strict=True):
-            with suppress(OSError, ValueError):  # the reader has gone, or the stream was closed
-                stream.reconfigure(errors=errors)
+def escape_unencodable() -> None:
+    """Escape characters that the standard streams' encoding lacks from now on."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
@@ -175,18 +167,11 @@ def print_notes() -> Iterator[None]:
     with warnings.catch_warnings():
         show = warnings.showwarning
 
-        def show_plainly(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
+        def show_plainly(message: Warning | str, category: type[Warning], *place: Any) -> None:
             if issubclass(category, UserNote):
                 print(f"note: {message}", flush=True)
             else:
-                show(message, category, filename, lineno, file, line)
+                show(message, category, *place)
 
         warnings.showwarning = show_plainly
         warnings.simplefilter("always", UserNote)

@@ -27,7 +27,7 @@ def add_execution_arguments(
     add_variant_argument(parser, variants)
     parser.add_argument(
         "--threads",
-        type=bounded_int(1, MAX_THREADS, "no machine has more cores"),
+        type=bounded_int(1, MAX_THREADS),
         metavar="N",
         help="number of CPU threads (default: one per core)",
     )

@@ -79,27 +79,22 @@ class RunProgress:
         return f"left {seconds // 60}:{seconds % 60:02d}"
 
 
-class StepProgress:
+class StepProgress(ExitStack):
     """Progress of several steps, one after the other, each with a bar of its own.
 
     A context manager. prefix: before the names of steps.
     """
 
     def __init__(self, prefix: str = "") -> None:
-        self._prefix, self._stack, self._step, self._most = prefix, ExitStack(), "", 0
-
-    def __enter__(self) -> StepProgress:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._stack.close()
+        super().__init__()
+        self._prefix, self._step, self._most = prefix, "", 0
 
     def update(self, step: str, done: int, total: int) -> None:
         """Show ``done`` of ``total`` in ``step``; less than before is not shown."""
         if step != self._step:
-            self._stack.close()
+            self.close()
             self._step, self._most = step, -1
-            self._shown = self._stack.enter_context(RunProgress(f"{self._prefix}{step}", total))
+            self._shown = self.enter_context(RunProgress(f"{self._prefix}{step}", total))
         if done > self._most:
             self._most = done
             self._shown.update(done, total)

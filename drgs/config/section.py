@@ -237,7 +237,7 @@ def explain_error(error: ErrorDetails) -> str:
         return f"{key} is missing"
     expected = "must be an object" if error["type"] == "model_type" else expectation(error)
     got = one_line(json.dumps(error["input"]), 60)
-    return f"{key or 'the content'} {one_line(expected, 200)}, got {got}"
+    return f"{key or 'the content'} {one_line(expected, 500)}, got {got}"
 
 
 def format_value(value: object) -> str:

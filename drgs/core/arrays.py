@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Generic, TypeVar, cast
 
@@ -46,21 +46,10 @@ def types_of(float_type: type) -> ArrayTypes:
     module = sys.modules[float_type.__module__]
     if not dr.is_float_v(float_type):
         float_type = module.Float
-    suffix = "64" if dr.type_v(float_type) == dr.VarType.Float64 else ""
-    return ArrayTypes(
-        Float=float_type,
-        UInt32=module.UInt32,
-        UInt64=module.UInt64,
-        Int32=module.Int32,
-        Bool=module.Bool,
-        Array2f=getattr(module, "Array2f" + suffix),
-        Array3f=getattr(module, "Array3f" + suffix),
-        Array4f=getattr(module, "Array4f" + suffix),
-        Array2u=module.Array2u,
-        Array4u=module.Array4u,
-        Matrix3f=getattr(module, "Matrix3f" + suffix),
-        TensorXf=getattr(module, "TensorXf" + suffix),
-    )
+    suffix = "64" if is_float64(float_type) else ""
+    names = [field.name for field in fields(ArrayTypes)]
+    types = {n: getattr(module, n + suffix if n.endswith("f") else n) for n in names}
+    return ArrayTypes(**types | {"Float": float_type})
 
 
 def is_float64(float_type: type) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +21,11 @@ class UserError(ValueError):
 
 class UserNote(UserWarning):
     """A note about an input that is used all the same; commands print its text."""
+
+
+def note_user(text: str) -> None:
+    """Emit a :class:`UserNote`, as of the caller's place."""
+    warnings.warn(UserNote(text), stacklevel=3)
 
 
 class PluginError(UserError):

@@ -36,7 +36,6 @@ _REMEDIES = {
     errno.ENAMETOOLONG: "choose a shorter name",
 }
 
-
 STEM_BYTES = 200  # of a derived file name, before numbers and suffixes
 
 

@@ -83,13 +83,9 @@ def installed_libraries() -> list[tuple[Version, str]]:
 
     Versions come from file names: loading is slow, and two libLLVM in one process conflict.
     """
-    libraries = set()
-    for folder in _library_folders():
-        for name in glob(os.path.join(folder, "libLLVM*")):
-            version = version_from_name(name)
-            if version is not None and os.path.isfile(name):
-                libraries.add((version, name))
-
+    names = {n for folder in _library_folders() for n in glob(os.path.join(folder, "libLLVM*"))}
+    files = filter(os.path.isfile, names)
+    libraries = [(version, name) for name in files if (version := version_from_name(name))]
     return sorted(libraries, key=lambda item: (item[0], len(item[1])), reverse=True)
 
 

@@ -22,9 +22,7 @@ _EXHAUSTED = re.compile(
 
 MAX_LANES = 2**32 - 1  # entries of an array of Dr.Jit, which counts them in 32 bits
 
-IMAGE_BYTES = (
-    250  # a pixel: tile entries, planes, the film's block, the image, its copy on the host
-)
+IMAGE_BYTES = 250  # a pixel: tile entries, planes, the film's block, the image, its host copy
 SAMPLE_BYTES = 80  # a further sample of a pixel: planes
 CHANNEL_BYTES = 24  # a channel besides colour: plane, block, image, copy
 

@@ -135,16 +135,6 @@ def _llvm_function(name: str, result: type | None) -> ctypes._NamedFuncPointer:
     return function
 
 
-def clear_memory_peak() -> None:
-    """Begin to measure :func:`memory_peak` anew."""
-    dr.detail.malloc_clear_statistics()
-
-
-def memory_peak() -> int:
-    """Return the peak memory, bytes, of the LLVM backend's arrays since the last clearing."""
-    return dr.detail.malloc_watermark(dr.JitBackend.LLVM)
-
-
 def new_rate_cache() -> _LRCache:
     """Return the cache of scaled learning rates of ``drjit.opt.Adam._step`` for a step."""
     from drjit.opt import _LRCache

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.cameras.viewpoints import Viewpoint, panorama_intrinsics
 from drgs.core.constants import SHUTTER_SAMPLES
-from drgs.core.errors import UserError, UserNote
+from drgs.core.errors import UserError, note_user
 from drgs.core.origin import WORLD, Origin
 from drgs.datasets.transforms import (
     CLOSE_POSE_KEY,
@@ -41,12 +40,10 @@ def read_viewpoints(
 
     size: width and height, px; None for the file's. ``fl_x`` and ``cx`` are px of the file's ``w``,
     ``fl_y`` and ``cy`` of its ``h``. shutter_samples: times at which motion blur is rendered.
-
-    Raises :class:`UserError` as :func:`read_transforms`.
     """
     meta = read_transforms(path)
     if meta.unread:
-        warnings.warn(UserNote(note_unread(meta.path, meta.unread)), stacklevel=2)
+        note_user(note_unread(meta.path, meta.unread))
     digits = len(str(len(meta.frames) - 1))
     return [
         _viewpoint_of(frame, f"camera_{index:0{digits}d}", size, shutter_samples)

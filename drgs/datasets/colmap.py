@@ -86,17 +86,15 @@ def find_model(folder: Path) -> tuple[Path, Path] | None:
     for workspace in WORKSPACES:
         root = folder / workspace
         for below in (*MODEL_FOLDERS, "."):
-            if model_files(root / below) and _has_photographs(root):
+            if model_files(root / below) and (
+                any((root / name).is_dir() for name in FACTORS)
+                or any(map(images_in, (root, *folders_in(root))))
+            ):
                 return root, root / below
     for below in MODEL_FOLDERS:
         if model_files(folder / below):
             return folder, folder / below
     return None
-
-
-def _has_photographs(root: Path) -> bool:
-    has_folder = any((root / name).is_dir() for name in FACTORS)
-    return has_folder or any(map(images_in, (root, *folders_in(root))))
 
 
 def folders_in(folder: Path) -> list[Path]:

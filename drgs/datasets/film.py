@@ -50,10 +50,9 @@ def to_film(view: Viewpoint, position: Columns) -> tuple[np.ndarray, np.ndarray,
         return u, v, np.where(visible, z, 0)
     Float = {4: llvm.Float, 8: llvm.Float64}[position[0].itemsize]
     point = types_of(Float).Array3f(*(from_host(Float, column) for column in position))
-    K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]])
     nearest = float(np.finfo(position[0].dtype).tiny)
     size = view.width, view.height
-    camera = Camera.create(Float, np.eye(3), np.zeros(3), K, *size, nearest)
+    camera = Camera.create(Float, np.eye(3), np.zeros(3), view.K, *size, nearest)
     lens = view.lens.upload(Float)
     visible, point, depth = lens.visibility(camera, point)
     film, depth = lens.project_point(camera, point), dr.select(visible, depth, 0)

@@ -73,8 +73,6 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
     """Return a configuration for the dataset in ``folder``, and the reasons for it, as text.
 
     overrides: given values, as for :func:`drgs.config.load.load_config`.
-
-    Raises :class:`UserError` for a folder that is no dataset, with a remedy.
     """
     overrides, where = list(overrides), str(folder)
     given = config_from({"data": {"path": folder}}, where, overrides)

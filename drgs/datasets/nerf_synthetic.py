@@ -16,8 +16,14 @@ from typing_extensions import override
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
-from drgs.datasets.notices import Notices
-from drgs.datasets.reader import DatasetReader, Intrinsics, describe_extras, load_views
+from drgs.datasets.reader import (
+    DatasetReader,
+    Intrinsics,
+    Notices,
+    Photographs,
+    load_views,
+    make_dataset,
+)
 from drgs.datasets.transforms import (
     TransformsFrame,
     focal_from_angle,
@@ -56,22 +62,12 @@ class NerfSyntheticReader(DatasetReader):
         if test_split != "train":
             test = _load_split(config, frames[test_split], keeps, notices)
             test = tuple(replace(view, alpha=None) for view in test)  # only training uses it
-        notices.emit(notes, train, () if test_split == "train" else test)
-        ignored, extras = describe_extras(config, [f for each in frames.values() for f in each])
-        return Dataset(
-            train=train,
-            test=test,
-            test_split=test_split,
-            background=config.background_rgb,
-            start_half_extent=START_HALF_EXTENT,
-            description=(
-                f"{config.path.name} (NeRF-synthetic layout): {len(train)} train views, measured "
-                f"on {len(test)} views of split {test_split}, {train[0].width}x{train[0].height}, "
-                f"background {config.background}{extras}"
-            ),
-            ignored=ignored,
-            rendered=True,  # photographs have no alpha, and are refused
-        )
+        read = [frame for split in frames.values() for frame in split]
+        photographs = Photographs("NeRF-synthetic", config.path, read, notes=notes)
+        how = f"of split {test_split}"
+        dataset = make_dataset(config, photographs, train, test, test_split, how, notices)
+        # Photographs have no alpha, and are refused.
+        return replace(dataset, start_half_extent=START_HALF_EXTENT, rendered=True)
 
     @override
     def image_files(self, config: DataConfig) -> list[Path]:

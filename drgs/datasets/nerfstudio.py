@@ -14,14 +14,13 @@ from typing_extensions import override
 
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
-from drgs.datasets.files import warn_of_unnamed_masks
+from drgs.datasets.files import FileKind, find_files, warn_of_unnamed_masks
 from drgs.datasets.reader import DatasetReader, Photographs
 from drgs.datasets.splits import Lists, listed_frames, unlisted_splits
-from drgs.datasets.transforms import (
-    find_point_cloud,
-    frames_with_files,
-    note_unread,
-    read_transforms,
+from drgs.datasets.transforms import frames_with_files, note_unread, read_transforms
+
+POINT_CLOUD = FileKind(
+    "point cloud", "the fit starts without", suffixes=frozenset(), is_needed=False
 )
 
 
@@ -38,15 +37,19 @@ class NerfstudioReader(DatasetReader):
     @override
     def photographs(self, config: DataConfig) -> Photographs:
         notes: list[str] = []
+        cloud, note = None, ""
         meta = read_transforms(config.path / "transforms.json")
         frames = frames_with_files(config, meta, notes)
-        cloud = find_point_cloud(config, meta, notes)
+        if meta.point_cloud is not None and config.ignore_points:
+            note = "; point cloud (ply_file_path) ignored"
+        elif meta.point_cloud is not None:
+            names, places = [meta.point_cloud], ["ply_file_path"]
+            existing = find_files(config.path, meta.path, names, POINT_CLOUD, places, notes)
+            cloud = existing.get(meta.point_cloud)
         if meta.unread:
             notes.append(note_unread(meta.path, meta.unread))
         if not config.ignore_masks and not any("mask" in frame.files for frame in frames):
             warn_of_unnamed_masks(config.path, notes)
-        is_ignored = meta.point_cloud is not None and config.ignore_points
-        note = "; point cloud (ply_file_path) ignored" if is_ignored else ""
         names = [frame.file_path for frame in meta.frames]
         if meta.lists:
             keys = {split: f"{split}_filenames" for split in meta.lists}

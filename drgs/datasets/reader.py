@@ -7,11 +7,13 @@ folder.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from pydantic import BaseModel
@@ -19,8 +21,10 @@ from pydantic import BaseModel
 from drgs.cameras.viewpoints import panorama_intrinsics
 from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
-from drgs.core.errors import UserError
+from drgs.core.errors import UserError, format_names, note_user, one_line
+from drgs.core.folders import digest
 from drgs.datasets.images import (
+    MemoryStore,
     Pixels,
     can_shift,
     choose_store,
@@ -36,9 +40,7 @@ from drgs.datasets.images import (
     read_mask,
     unread_image,
 )
-from drgs.datasets.notices import Notices
 from drgs.datasets.splits import Lists, split_of
-from drgs.datasets.storage import MemoryStore
 from drgs.datasets.transforms import (
     CLOSE_POSE_KEY,
     TransformsFrame,
@@ -50,10 +52,7 @@ from drgs.datasets.transforms import (
     unique_names,
 )
 from drgs.datasets.types import Dataset, View, ViewFilter, all_views
-from drgs.io.images import read_header, read_pixels, upright
-
-if TYPE_CHECKING:
-    from drgs.cameras.lens import Lens
+from drgs.io.images import colour_profile, read_header, read_pixels, upright
 
 __all__ = ["READERS", "DatasetReader", "Photographs", "TransformsFrame"]
 
@@ -62,6 +61,8 @@ MAX_WIDTH = 1600
 
 DEPTH_IMAGE_UNIT = 1e-3
 """Scene units in a step of a depth image without ``depth_unit_scale_factor``, as in nerfstudio."""
+
+MAX_NOTE_CHARACTERS = 1000
 
 T = TypeVar("T")
 
@@ -110,38 +111,48 @@ class DatasetReader:
         frames = sorted(photographs.frames, key=lambda frame: frame.file_path)
         names = [frame.file_path for frame in frames]
         split = split_of(config, photographs.source, photographs.lists, names, photographs.notes)
-        changes: dict[str, object] = {}
+        changes: dict[str, object] = {"image_size": config.image_size or MAX_WIDTH}
         if config.background is None:
             is_any_transparent = any(read_header(f.files["image"]).has_alpha for f in frames)
             changes["background"] = "white" if is_any_transparent else "black"
-        if config.image_size is None:
-            changes["image_size"] = MAX_WIDTH
         config, notices = config.model_copy(update=changes), Notices(config.path)
         used = sorted({*split.train, *split.test})
         views = load_views(config, [frames[i] for i in used], _intrinsics, keeps, notices)
         views = dict(zip(used, views, strict=True))
         train, test = (tuple(views[i] for i in indices) for indices in (split.train, split.test))
-        measured = () if split.name == "train" else test
-        notices.emit(photographs.notes, train, measured)
-        ignored, extras = describe_extras(config, frames)
-        return Dataset(
-            train=train,
-            test=test,
-            test_split=split.name,
-            background=config.background_rgb,
-            start_half_extent=None,
-            description=(
-                f"{config.path.name} ({photographs.layout} layout): {len(train)} train views, "
-                f"measured on {len(test)} views ({split.how}), {train[0].width}x{train[0].height}, "
-                f"background {config.background}{extras}{photographs.note}"
-            ),
-            ignored=ignored,
-            point_cloud=photographs.point_cloud,
-        )
+        return make_dataset(config, photographs, train, test, split.name, f"({split.how})", notices)
 
     def image_files(self, config: DataConfig) -> Sequence[Path]:
         """Return the files of the photographs, from whose sizes a configuration is chosen."""
         return [frame.files["image"] for frame in self.photographs(config).frames]
+
+
+def make_dataset(
+    config: DataConfig,
+    photographs: Photographs,
+    train: tuple[View, ...],
+    test: tuple[View, ...],
+    test_split: str,
+    how: str,
+    notices: Notices,
+) -> Dataset:
+    """Return a dataset of loaded views, and emit the notes on it; how: test views were chosen."""
+    notices.emit(photographs.notes, train, () if test_split == "train" else test)
+    ignored, extras = describe_extras(config, photographs.frames)
+    return Dataset(
+        train=train,
+        test=test,
+        test_split=test_split,
+        background=config.background_rgb,
+        start_half_extent=None,
+        description=(
+            f"{config.path.name} ({photographs.layout} layout): {len(train)} train views, "
+            f"measured on {len(test)} views {how}, {train[0].width}x{train[0].height}, "
+            f"background {config.background}{extras}{photographs.note}"
+        ),
+        ignored=ignored,
+        point_cloud=photographs.point_cloud,
+    )
 
 
 def load_views(
@@ -154,9 +165,6 @@ def load_views(
     """Return the views of frames; images that ``keeps`` does not accept by name are not read.
 
     intrinsics: takes a frame, the shape of its photograph (H, W, C) and the size W, H of the view.
-
-    Raises :class:`UserError` for images that do not fit into memory or on a disk, and for those
-    that cannot be read.
     """
     names = unique_names([frame.file_path for frame in frames])
     files = [frame.files["image"] for frame in frames]
@@ -165,7 +173,6 @@ def load_views(
 
     def load(frame: TransformsFrame, name: str) -> View:
         file, is_read = frame.files["image"], keeps(name)
-
         pixels = read_pixels(file) if is_read else placeholder_pixels(file)
         pixels = orient_as_calibrated(pixels, frame)
         if is_read:
@@ -173,17 +180,16 @@ def load_views(
         height, width = pixels.shape[:2]
         size = downscaled_size(width, height, config.image_size)
         camera = intrinsics(frame, pixels.shape, size)  # first: raises for a wrong size
-        image, alpha, mask, depth = (
-            _read_images(config, frame, pixels, store)
-            if is_read
-            else _unread_images(frame, pixels, size)
-        )
+        read = _read_images(config, frame, pixels, store) if is_read else None
+        image, alpha, mask, depth = read or _unread_images(frame, pixels, size)
+        if (lens := lens_of(frame)) is not None and lens.distorts and config.ignore_distortion:
+            lens = None
         return View(
             name,
             frame.values.transform_matrix,
             *camera,
             *size,
-            lens=rendered_lens(config, frame),
+            lens=lens,
             motion=None if config.ignore_motion else motion_of(frame, config.shutter_samples),
             image=image,
             alpha=alpha,
@@ -244,15 +250,13 @@ def _intrinsics(
     fx = _focal(frame, "x", width)
     has_fy = values.fl_y is not None or values.camera_angle_y is not None
     fy = _focal(frame, "y", height) if has_fy else fx
-    cx, cy = (_principal(frame, key, side) for key, side in (("cx", width), ("cy", height)))
+    cx, cy = width / 2, height / 2
+    if values.cx is not None:
+        cx = principal_point(values.cx, frame.location("cx"), width)
+    if values.cy is not None:
+        cy = principal_point(values.cy, frame.location("cy"), height)
     x, y = size[0] / width, size[1] / height
     return fx * x, fy * y, cx * x, cy * y
-
-
-def rendered_lens(config: DataConfig, frame: TransformsFrame) -> Lens | None:
-    """Return the frame's lens; None for a pinhole, and for one whose distortion is ignored."""
-    lens = lens_of(frame)
-    return None if lens is not None and lens.distorts and config.ignore_distortion else lens
 
 
 def _focal(frame: TransformsFrame, axis: str, side: int) -> float:
@@ -266,19 +270,11 @@ def _focal(frame: TransformsFrame, axis: str, side: int) -> float:
     )
 
 
-def _principal(frame: TransformsFrame, key: str, side: int) -> float:
-    value = getattr(frame.values, key)
-    return side / 2 if value is None else principal_point(value, frame.location(key), side)
-
-
 # Images, masks and depths of a frame
 
 
 def _read_images(
-    config: DataConfig,
-    frame: TransformsFrame,
-    pixels: np.ndarray,
-    store: MemoryStore,
+    config: DataConfig, frame: TransformsFrame, pixels: np.ndarray, store: MemoryStore
 ) -> Images:
     files, stored, depth = frame.files, (pixels.shape[1], pixels.shape[0]), None
     image, alpha = compact_photograph(pixels, config.background_rgb, config.image_size, store)
@@ -343,3 +339,62 @@ def describe_extras(
     if "motion" in ignored:
         text += f"; motion ({CLOSE_POSE_KEY}) ignored"
     return ignored, text
+
+
+# Notes for the user on the photographs
+
+
+class Notices:
+    """Collects findings while photographs are read, on several threads."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._findings: dict[str, list[str]] = {}  # names of photographs
+
+    def inspect(self, file: Path, pixels: np.ndarray) -> None:
+        """Record findings on a photograph; pixels: (H, W, C), as they were read."""
+        findings = []
+        if profile := colour_profile(file):
+            findings.append(f"with the colour profile {profile}, which is not applied")
+        if pixels.shape[2] == 4 and not pixels[:, :, 3].any():
+            findings.append("that are transparent everywhere")
+        for finding in findings:
+            self._findings.setdefault(finding, []).append(self._name(file))
+
+    def emit(self, notes: Sequence[str], train: Sequence[View], test: Sequence[View]) -> None:
+        """Emit ``notes`` and the findings, each as a :class:`UserNote`."""
+        texts = [f"photographs {what}: {_format_files(n)}" for what, n in self._findings.items()]
+        texts += self._duplicate_notes(train, test)
+        for note in (*notes, *(f"{self._folder}: {text}" for text in texts)):
+            note_user(one_line(note, MAX_NOTE_CHARACTERS))
+
+    def _name(self, file: Path) -> str:
+        is_below = file.is_relative_to(self._folder)
+        return str(file.relative_to(self._folder) if is_below else file)
+
+    def _duplicate_notes(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
+        """Return a note on duplicate photographs, or none."""
+        groups = [[*train, *test]]
+        for key in (os.path.getsize, digest):
+            groups = [part for group in groups for part in _group_duplicates(group, cache(key))]
+        if not groups:
+            return []
+        pairs = [" = ".join(self._name(v.files["image"]) for v in group) for group in groups]
+        note = f"the same photograph more than once: {_format_files(pairs)}"
+        in_train, in_test = ({view.files["image"] for view in views} for views in (train, test))
+        files = [{view.files["image"] for view in group} for group in groups]
+        both = sum(bool(group & in_train and group & in_test) for group in files)
+        return [note + (f"; {both:,} of them both trained and measured on" if both else "")]
+
+
+def _format_files(names: Sequence[str]) -> str:
+    ordered = sorted(names)
+    return f"{len(ordered):,} ({format_names(ordered)})"
+
+
+def _group_duplicates(views: Sequence[View], key: Callable[[Path], object]) -> list[list[View]]:
+    """Return groups of several views whose photographs have the same key."""
+    groups: dict[object, list[View]] = {}
+    for view in views:
+        groups.setdefault(key(view.files["image"]), []).append(view)
+    return [group for group in groups.values() if len(group) > 1]

@@ -187,10 +187,7 @@ def _split_every_nth(config: DataConfig, source: Path, num_views: int) -> Split:
 
 
 def leave_out(dataset: Dataset, config: DataConfig) -> Dataset:
-    """Return the dataset without the photographs of ``data.leave_out``.
-
-    Raises :class:`UserError` for a name that no photograph has, and if none is left to train on.
-    """
+    """Return the dataset without the photographs of ``data.leave_out``."""
     if not config.leave_out:
         return dataset
     views = (*dataset.train, *dataset.test)
@@ -200,11 +197,10 @@ def leave_out(dataset: Dataset, config: DataConfig) -> Dataset:
             raise UserError(
                 f"data.leave_out: {config.path} has no photograph {one_line(name, 60)}{nearest}"
             )
-
-    def left(views: tuple[View, ...]) -> tuple[View, ...]:
-        return tuple(v for v in views if not any(_is_named(v, n) for n in config.leave_out))
-
-    train, test = left(dataset.train), left(dataset.test)
+    train, test = (
+        tuple(v for v in part if not any(_is_named(v, name) for name in config.leave_out))
+        for part in (dataset.train, dataset.test)
+    )
     if dataset.train and not train:
         raise UserError(f"data.leave_out: no photograph is left to train on in {config.path}")
     count = len(views) - len(train) - len(test)

@@ -15,13 +15,14 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetPydanticSchema, Strict
 from pydantic_core.core_schema import no_info_after_validator_function
 
 from drgs.cameras.axes import between_opencv_and_opengl
+from drgs.cameras.lens import LENSES, Lens
 from drgs.cameras.viewpoints import MAX_COORDINATE, CameraMotion
 from drgs.config.schema import DataConfig
 from drgs.config.section import parse_json, validate
@@ -30,9 +31,6 @@ from drgs.core.files import read_text, shorten_stem
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.datasets.files import FileKind, find_files
 from drgs.io.images import MAX_SIDE
-
-if TYPE_CHECKING:
-    from drgs.cameras.lens import Lens
 
 MAX_BYTES = 1 << 28  # of a file: a thousand for each of a quarter of a million views
 
@@ -51,14 +49,11 @@ DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1")
 
 RATIONAL_MODEL = "FULL_OPENCV"  # the model of a camera that has k4 to k6
 
-PLANE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", RATIONAL_MODEL)
-FISHEYE_MODELS = (
-    *("SIMPLE_FISHEYE", "FISHEYE"),
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"),
-)
 LENS_OF_MODEL = {
-    **dict.fromkeys(PLANE_MODELS, "opencv"),
-    **dict.fromkeys(FISHEYE_MODELS, "fisheye"),
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "opencv"),
+    **dict.fromkeys(("OPENCV", RATIONAL_MODEL), "opencv"),
+    **dict.fromkeys(("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE"), "fisheye"),
+    **dict.fromkeys(("RADIAL_FISHEYE", "OPENCV_FISHEYE"), "fisheye"),
     "THIN_PRISM_FISHEYE": "thin_prism_fisheye",
     "EQUIRECTANGULAR": "equirectangular",
 }
@@ -92,10 +87,6 @@ FILE_KINDS = {
     ),
 }
 
-POINT_CLOUD = FileKind(
-    "point cloud", "the fit starts without", suffixes=frozenset(), is_needed=False
-)
-
 
 # Content of a file
 
@@ -120,14 +111,11 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
 
 
 def _known_model(model: str) -> str:
-    if model not in LENS_OF_MODEL:
-        from drgs.cameras.lens import LENSES
-
-        if model not in LENSES.names():
-            raise ValueError(
-                f"must be one of {', '.join(LENS_OF_MODEL)}, or a lens: "
-                f"{', '.join(LENSES.names())}; {HOW_TO_INSTALL}"
-            )
+    if model not in LENS_OF_MODEL and model not in LENSES.names():
+        raise ValueError(
+            f"must be one of {', '.join(LENS_OF_MODEL)}, or a lens: {', '.join(LENSES.names())}; "
+            f"{HOW_TO_INSTALL}"
+        )
     return model
 
 
@@ -249,7 +237,8 @@ def read_transforms(path: Path) -> TransformsFile:
     """
     text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
     meta = validate(Transforms, parse_json(text, f"{path}: "), f"{path}: ")
-    top = {name: getattr(meta, name) for name in CameraValues.model_fields} | _extra(meta)
+    top = {name: getattr(meta, name) for name in CameraValues.model_fields}
+    top |= meta.model_extra or {}
     frames = []
     for index, frame in enumerate(meta.frames):
         inherited = {key: value for key, value in top.items() if getattr(frame, key, None) is None}
@@ -265,16 +254,12 @@ def note_unread(path: Path, keys: Sequence[str]) -> str:
     return f"{path}: keys that are not read: {format_names(keys, 8)}"
 
 
-def _extra(values: CameraValues) -> dict[str, object]:
-    return values.model_extra or {}
-
-
 def _unread_keys(meta: Transforms) -> list[str]:
     """Return sorted keys; those of frames as ``frames[].key``."""
     models = {values.camera_model for values in (meta, *meta.frames)}
     known = IGNORED_KEYS.union(*map(_coefficient_names, models))
-    top = _extra(meta).keys() - known
-    in_frames = set().union(*map(_extra, meta.frames)) - known
+    top = (meta.model_extra or {}).keys() - known
+    in_frames = set().union(*(frame.model_extra or {} for frame in meta.frames)) - known
     keys = [*sorted(top), *(f"frames[].{key}" for key in sorted(in_frames))]
     return [one_line(key, 60) for key in keys]
 
@@ -282,8 +267,6 @@ def _unread_keys(meta: Transforms) -> list[str]:
 def _coefficient_names(model: str | None) -> tuple[str, ...]:
     if model is None or model in LENS_OF_MODEL:
         return DISTORTION
-    from drgs.cameras.lens import LENSES
-
     return LENSES.get(model).value.coefficient_names()
 
 
@@ -320,15 +303,6 @@ def frames_with_files(
     return frames
 
 
-def find_point_cloud(config: DataConfig, meta: TransformsFile, notes: list[str]) -> Path | None:
-    """Return the point cloud that the file names, if it is there and not ignored."""
-    if meta.point_cloud is None or config.ignore_points:
-        return None
-    names, places = [meta.point_cloud], ["ply_file_path"]
-    existing = find_files(config.path, meta.path, names, POINT_CLOUD, places, notes)
-    return existing.get(meta.point_cloud)
-
-
 # Optics
 
 
@@ -362,8 +336,6 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
     Raises :class:`UserError` for coefficients that the lens does not have, and for a k4 that may be
     OpenCV's, the first coefficient of a denominator, or nerfstudio's, the fourth of the polynomial.
     """
-    from drgs.cameras.lens import LENSES
-
     model, values = frame.values.camera_model, frame.values
     name = "opencv" if model is None else LENS_OF_MODEL.get(model, model)
     is_of_colmap = model is None or model in LENS_OF_MODEL

@@ -6,16 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import EllipsisType
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.core.origin import WORLD, Origin
-
-if TYPE_CHECKING:
-    pass
-
 
 T = TypeVar("T")
 
@@ -78,7 +74,6 @@ ViewFilter = Callable[[str], bool]  # accepts names of views whose images are to
 
 def all_views(name: str) -> bool:
     """Accept all views."""
-    del name
     return True
 
 

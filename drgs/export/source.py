@@ -16,7 +16,7 @@ from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, UserNote
 from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.similarity import rotation_towards, shortest_rotation
+from drgs.gaussians.similarity import Similarity, shortest_rotation
 from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS
 from drgs.results.folder import load_run_config, require_results
 from drgs.results.refined_cameras import training_cameras
@@ -51,10 +51,10 @@ class ExportSource:
     def turn(self, up: np.ndarray, towards: np.ndarray) -> ExportSource:
         """Return this with the direction ``up`` (3,) rotated to ``towards``."""
         turn, cameras = np.eye(4), self.cameras
-        turn[:3, :3] = shortest_rotation(up, towards)
+        turn[:3, :3] = rotation = shortest_rotation(up, towards)
         if cameras is not None:
             cameras = [replace(v, camera_to_world=turn @ v.camera_to_world) for v in cameras]
-        gaussians = rotation_towards(self.gaussians, up, towards)
+        gaussians = Similarity(1.0, rotation, np.zeros(3)).of_gaussians(self.gaussians)
         return replace(self, gaussians=gaussians, cameras=cameras, is_turned=True)
 
 

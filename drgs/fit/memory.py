@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.core.memory import available_memory, format_bytes, resident_memory
-from drgs.datasets.storage import is_on_disk
+from drgs.datasets.images import is_on_disk
 from drgs.datasets.types import Dataset, View
 from drgs.splatting.reduction import BAND_SLOTS
 from drgs.training.density.phases import density_strategy

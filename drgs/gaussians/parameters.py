@@ -8,7 +8,6 @@ from it.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from drgs.core.arrays import from_host
-from drgs.core.errors import UserError, UserNote
+from drgs.core.errors import UserError, note_user
 from drgs.core.files import atomic_path
 from drgs.core.origin import WORLD, Origin, format_origin
 from drgs.core.registry import HOW_TO_INSTALL
@@ -113,8 +112,7 @@ class Gaussians(Generic[Tensor]):
         if self.origin != WORLD and not chosen.holds(ORIGIN[0]):
             lost.append(f"the origin {format_origin(self.origin)} of its coordinates")
         if lost:
-            note = f"the format {name} has no room for {', '.join(lost)}: left out"
-            warnings.warn(UserNote(note), stacklevel=2)
+            note_user(f"the format {name} has no room for {', '.join(lost)}: left out")
         host = host._rotate(Z_TO_Y) if chosen.up == "y" else host
         if self.origin != WORLD:
             values |= dict(zip(ORIGIN, host.origin, strict=True))

@@ -36,10 +36,7 @@ def to_float32(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def rotate_gaussians(
-    means: np.ndarray,
-    quats: np.ndarray,
-    shN: np.ndarray,
-    rotation: np.ndarray,
+    means: np.ndarray, quats: np.ndarray, shN: np.ndarray, rotation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions, quaternions and harmonics after x' = R x; float64, of the same shapes.
 

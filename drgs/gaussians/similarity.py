@@ -70,22 +70,11 @@ class Similarity:
         return replace(g, **{name: to_float32(name, getattr(g, name)) for name in names})
 
 
-def rotation_towards(
-    gaussians: Gaussians[np.ndarray], direction: np.ndarray, towards: np.ndarray
-) -> Gaussians[np.ndarray]:
-    """Return the model (numpy) turned, the shortest way, so that ``direction`` becomes ``towards``.
-
-    direction, towards: (3,) world, of length 1. Opposite ones: about the axis that is nearest to
-    perpendicular, x before y before z.
-    """
-    rotation = shortest_rotation(direction, towards)
-    return Similarity(1.0, rotation, np.zeros(3)).of_gaussians(gaussians)
-
-
 def shortest_rotation(direction: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """Return the rotation R (3, 3) with R direction = towards: see :func:`rotation_towards`.
+    """Return the rotation R (3, 3) with R direction = towards, both (3,) of length 1.
 
-    Two reflections (Householder), by the plane between both and by ``direction``'s own.
+    Two reflections (Householder), by the plane between both and by ``direction``'s own. Opposite
+    ones: about the axis that is nearest to perpendicular, x before y before z.
     """
     between = direction + towards
     if np.linalg.norm(between) < 1e-6:  # opposite: half a turn about what is perpendicular

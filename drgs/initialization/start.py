@@ -14,7 +14,8 @@ from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.constants import SH_C0
 from drgs.core.environment import denormals_kept
 from drgs.core.errors import UserError
-from drgs.datasets.types import Dataset
+from drgs.datasets.film import is_projectable, shown_points
+from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start_box import (
@@ -38,6 +39,15 @@ MIN_SPACING = 2.5e-4
 their middle. The 3DGS reference has 3.2e-4 world units, for scenes of about unit size."""
 
 NUM_NEIGHBOURS = 3
+
+MAX_COLOR_VIEWS, MIN_COLOR_VIEWS = 60, 8
+"""Number of views whose images colour points: a third of them see most points."""
+
+MAX_COLOR_BYTES = 1 << 27  # memory for colours: of a million points, fewer views are read
+
+MIN_ALPHA = 0.5  # less opaque pixels mostly show the background
+
+POINTS_PER_SORT = 1 << 13
 
 COLMAP_POINT_FILES = ("points3D.bin", "points3D.txt")  # have errors and observations of points
 
@@ -224,8 +234,6 @@ def _random_start(config: FitConfig, dataset: Dataset) -> Start:
 
 def _with_colors(start: Start, dataset: Dataset) -> Start:
     """Return the start with colours from the images, if they show any of the points."""
-    from drgs.initialization.point_colors import colors_from_images
-
     spacing = np.sqrt(mean_squared_neighbour_distance(start.means))
     colors = colors_from_images(start.means, spacing, dataset.train, dataset.background)
     if colors is None:
@@ -268,3 +276,81 @@ def _check_cloud(file: Path, points: np.ndarray, max_gaussians: int, dataset: Da
             "the middle of their images; give another init.point_cloud, or start from random "
             "points (init.point_cloud=null, data.ignore_points=true)"
         )
+
+
+# Colours of points from the images that show them
+
+
+def colors_from_images(
+    points: np.ndarray,
+    spacing: np.ndarray,
+    views: Sequence[View],
+    background: tuple[float, float, float],
+) -> np.ndarray | None:
+    """Return colours (N, 3) float32, display space 0..1; None: no image shows any of the points.
+
+    An image shows a point if no other point is clearly nearer to its camera in a z-buffer whose
+    pixels are as wide as the points are apart. On a surface that turns away from the camera, points
+    hide each other, so that images count that look onto it. The middle half of a point's colours is
+    averaged: the rest may be highlights or occluders.
+
+    points: (N, 3) world; spacing: (N,) scene units, of each to its neighbours; background: of
+    the composited images, display space. A point that no image shows gets the colour of the nearest
+    point that is shown.
+    """
+    views = [view for view in views if is_projectable(view)]
+    most = max(MIN_COLOR_VIEWS, min(MAX_COLOR_VIEWS, MAX_COLOR_BYTES // (12 * len(points))))
+    views = views[:: -(-len(views) // most) or 1]
+    samples = np.full((len(views), len(points), 3), np.inf, np.float32)
+    columns = [np.ascontiguousarray(c, np.float64) for c in np.asarray(points).T]
+    for view, sample in zip(views, samples, strict=True):
+        rows, colors = _find_shown_points(view, columns, spacing, background)
+        sample[rows] = colors
+    colors = np.concatenate(
+        [
+            _middle_mean(samples[:, k : k + POINTS_PER_SORT])
+            for k in range(0, len(points), POINTS_PER_SORT)
+        ]
+    )
+    unseen = np.isnan(colors[:, 0])
+    if unseen.all():
+        return None
+    if unseen.any():
+        with denormals_kept():
+            _, nearest = KDTree(points[~unseen]).query(points[unseen])
+        colors[unseen] = colors[~unseen][nearest]
+    return colors
+
+
+def _find_shown_points(
+    view: View,
+    columns: Sequence[np.ndarray],
+    spacing: np.ndarray,
+    background: tuple[float, float, float],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return indices of points that the image shows, and their colours (M, 3) float32, 0..1."""
+    rows, at, _ = shown_points(view, columns, spacing)
+    if not len(rows):
+        return rows, np.empty((0, 3), np.float32)
+    colors, opaque = np.asarray(view.image)[at], np.ones(len(rows), bool)
+    if view.alpha is not None:
+        alpha = np.asarray(view.alpha)[at][:, None]
+        opaque = alpha[:, 0] >= MIN_ALPHA
+        behind = (1 - alpha) * np.asarray(background, np.float32)
+        colors = (colors - behind) / np.maximum(alpha, MIN_ALPHA)
+    if view.mask is not None:
+        opaque &= np.asarray(view.mask)[at] > 0
+    return rows[opaque], np.clip(colors[opaque], 0, 1)
+
+
+def _middle_mean(samples: np.ndarray) -> np.ndarray:
+    """Return means (N, 3) of the middle half of (V, N, 3), channel by channel; NaN: there are none.
+
+    inf: not a sample. Of n, floor(n / 4) are left out at either end.
+    """
+    ordered, count = np.sort(samples, axis=0), np.isfinite(samples[:, :, 0]).sum(axis=0)
+    rank, left_out = np.arange(len(samples))[:, None], count // 4
+    kept = (rank >= left_out) & (rank < count - left_out)
+    total = np.where(kept[:, :, None], ordered, 0).sum(axis=0, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        return (total / kept.sum(axis=0)[:, None]).astype(np.float32)

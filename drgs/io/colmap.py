@@ -83,19 +83,11 @@ class ColmapImage:
     camera_to_world: np.ndarray  # (4, 4) float64, OpenCV axes
 
 
-@dataclass(frozen=True, eq=False)
-class ColmapPoints:
-    """Points of structure from motion, N points."""
-
-    positions: np.ndarray  # (N, 3) float64, world
-    colors: np.ndarray  # (N, 3) uint8
-    errors: np.ndarray  # (N,) float64, px: mean distance of its observations; -1: not known
-    track_lengths: np.ndarray  # (N,) int64: number of its observations
-
-
-_POINT = np.dtype(
-    [("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("track_length", "<i8")]
+POINT = np.dtype(
+    [("positions", "<f8", 3), ("colors", "u1", 3), ("errors", "<f8"), ("track_lengths", "<i8")]
 )
+"""A point: world position, colour, mean distance of its observations (px; -1: not known), and their
+number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +116,7 @@ def model_files(folder: Path) -> dict[str, Path] | None:
 
 
 def read_model(folder: str | Path) -> ColmapModel:
-    """Return the model in ``folder``, without its points.
-
-    Raises :class:`UserError` naming the file, the byte or line, the expected and the actual
-    value.
-    """
+    """Return the model in ``folder``, without its points."""
     files = model_files(Path(folder))
     if files is None:
         raise UserError(
@@ -139,8 +127,8 @@ def read_model(folder: str | Path) -> ColmapModel:
     return ColmapModel(cameras, _images(_records(files["images"]), cameras), files.get("points3D"))
 
 
-def read_points3d(path: str | Path) -> ColmapPoints:
-    """Return the points of ``points3D.bin`` or ``.txt``."""
+def read_points3d(path: str | Path) -> np.recarray:
+    """Return the points of ``points3D.bin`` or ``.txt``, each a :data:`POINT`."""
     return _points(_records(Path(path)))
 
 
@@ -214,7 +202,7 @@ def _camera_to_world(w: float, x: float, y: float, z: float, *translation: float
     return pose
 
 
-def _points(records: Iterable[tuple]) -> ColmapPoints:
+def _points(records: Iterable[tuple]) -> np.recarray:
     def rows() -> Iterator[tuple]:
         for place, position, color, error, track_length in records:
             _check_numbers(place, ("X", "Y", "Z", "ERROR"), (*position, error))
@@ -222,8 +210,7 @@ def _points(records: Iterable[tuple]) -> ColmapPoints:
                 raise UserError(f"{place}: colours must be 0 to 255, got {tuple(color)}")
             yield tuple(position), tuple(color), error, track_length
 
-    table = np.fromiter(rows(), _POINT)
-    return ColmapPoints(*(np.ascontiguousarray(table[name]) for name in _POINT.names or ()))
+    return np.fromiter(rows(), POINT).view(np.recarray)
 
 
 def _check_numbers(place: Place, names: Sequence[str], values: Sequence[float]) -> None:

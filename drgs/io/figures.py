@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def new_figure(width: float, height: float, paper: str = "white", dpi: float = 110) -> Figure:
-    """Return an empty figure; width, height: inches; paper: its colour; dpi: pixels per inch."""
+def new_figure(width: float, height: float, paper: str = "white") -> Figure:
+    """Return an empty figure of 110 pixels per inch; width, height: inches; paper: its colour."""
     # Without pyplot no window system is looked for.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=dpi, facecolor=paper, layout="constrained")
+    figure = Figure(figsize=(width, height), dpi=110, facecolor=paper, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 

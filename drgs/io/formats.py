@@ -35,9 +35,7 @@ SHAPES = {
 """Shapes that a Gaussian's part of each array can have; ``smoothing`` may be missing."""
 
 Arrays = Mapping[str, np.ndarray]
-"""Float32 arrays by the names of the fields of ``Gaussians``: ``means`` (N, 3), ``quats`` (N, 4)
-wxyz, ``log_scales`` (N, 3), ``logit_opacities`` (N,), ``sh0`` (N, 1, 3), ``shN`` (N, K - 1, 3), and
-``smoothing`` (N,) where there is a smoothing filter."""
+"""Float32 arrays (N, *shape) by name, as the fields of ``Gaussians``; quaternions are wxyz."""
 
 ORIGIN = ("origin_x", "origin_y", "origin_z")  # in ``rendered_with``: world, of the means
 
@@ -108,19 +106,14 @@ class FileFormat:
 FORMATS: Registry[type[FileFormat]] = Registry("file format", "drgs.formats")
 
 
-def file_formats() -> list[Extension[type[FileFormat]]]:
-    """Return all formats."""
-    return FORMATS.all()
-
-
 def readable_formats() -> list[Extension[type[FileFormat]]]:
     """Return the formats whose files can be read."""
-    return [each for each in file_formats() if each.value.read is not FileFormat.read]
+    return [each for each in FORMATS.all() if each.value.read is not FileFormat.read]
 
 
 def writable_formats() -> list[Extension[type[FileFormat]]]:
     """Return the formats whose files can be written."""
-    return [each for each in file_formats() if each.value.encode is not FileFormat.encode]
+    return [each for each in FORMATS.all() if each.value.encode is not FileFormat.encode]
 
 
 def _shipped_formats() -> list[Extension[type[FileFormat]]]:
@@ -174,8 +167,6 @@ def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) ->
     """Return the content of a file in the format ``name``, as :meth:`FileFormat.encode`.
 
     Values of ``rendered_with`` that the format cannot hold are left out.
-
-    Raises :class:`UserError` for Gaussians that the format cannot hold.
     """
     extension = FORMATS.get(name)
     check(name, gaussians)
@@ -217,11 +208,7 @@ def _check_arrays(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
 
 
 def check_range(
-    where: str | Path,
-    name: str,
-    values: np.ndarray,
-    least: float = -np.inf,
-    most: float = np.inf,
+    where: str | Path, name: str, values: np.ndarray, least: float = -np.inf, most: float = np.inf
 ) -> None:
     """Raise :class:`UserError` for a value (N, ...) that is not finite, or out of range.
 

@@ -44,9 +44,8 @@ from drgs.io.formats import (
 )
 from drgs.io.ply import STATEMENT
 from drgs.io.quantization import (
+    arrays_from_activated,
     colors_from_sh0,
-    log_scales_from_scales,
-    logits_from_opacities,
     normalize_quaternions,
     opacities_from_logits,
     require_scene_memory,
@@ -113,18 +112,13 @@ class Glb(FileFormat):
         harmonics = np.stack(
             [document.values(name, 3).astype(np.float32) for name in _harmonics(count)], axis=1
         )
-        arrays = {
-            "quats": np.roll(document.values(f"{EXTENSION}:ROTATION", 4), 1, axis=1),
-            "log_scales": log_scales_from_scales(scales),
-            "logit_opacities": logits_from_opacities(opacities[:, 0]),
-            "sh0": harmonics[:, :1],
-            "shN": harmonics[:, 1:],
-        }
-        arrays["means"], origin = recenter_means(means + document.translation)
+        quats = np.roll(document.values(f"{EXTENSION}:ROTATION", 4), 1, axis=1)
+        moved, origin = recenter_means(means + document.translation)
         settings = document.rendered_with
         if origin != WORLD:  # exactly the file's
-            arrays["means"] = means
+            moved = means
             settings = settings | dict(zip(ORIGIN, document.translation, strict=True))
+        arrays = arrays_from_activated(moved, quats, scales, opacities[:, 0], harmonics)
         return arrays, settings
 
     @override
@@ -334,11 +328,7 @@ class _Document:
         return self._item("accessors", self.file.accessors, index, _Accessor)
 
     def values(
-        self,
-        name: str,
-        width: int,
-        least: float = -np.inf,
-        most: float = np.inf,
+        self, name: str, width: int, least: float = -np.inf, most: float = np.inf
     ) -> np.ndarray:
         """Return an attribute (N, width) float64 of finite numbers from ``least`` to ``most``."""
         accessor = self.accessor(name)

@@ -43,7 +43,6 @@ MAX_16_BITS = 2**16 - 1
 MITSUBA_FORMATS = ("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA")
 """Pillow's names of the formats that Mitsuba reads as well. MPO is a JPEG with several images."""
 
-
 FIRST_TRANSPOSED_ORIENTATION = 5  # EXIF's orientations from this one exchange width and height
 
 INVERSE_ORIENTATIONS = {6: 8, 8: 6}  # other orientations are their own inverses
@@ -83,7 +82,7 @@ class ImageHeader:
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Return the header of an image; raises :class:`UserError` for a file that is none."""
+    """Return the header of an image; raises :class:`UserError` for one that is not read."""
     with _open_image(path) as image:
         size = image.size
         if image.format == "TIFF":  # Pillow's size is that of the upright image
@@ -147,21 +146,12 @@ def as_numbers(pixels: np.ndarray) -> np.ndarray:
     return numbers
 
 
-def check_readable(path: Path) -> None:
-    """Raise :class:`UserError` as :func:`read_pixels` does, as far as the header shows it."""
-    with _open_image(path) as image:
-        _check_supported(path, image)
-
-
 def read_pixels(path: Path) -> np.ndarray:
     """Return (H, W, C) as stored (EXIF orientation is not applied), uint8 or 16 bits in an integer.
 
     C is 3, or 4 with straight (not premultiplied) alpha; grey images become RGB.
-
-    Raises :class:`UserError` for any other file.
     """
     with _open_image(path) as image:
-        _check_supported(path, image)  # before memory is allocated for it
         needed = image.width * image.height * PIXEL_BYTES
         require_memory(path, needed, f"an image of {image.width} x {image.height} px")
         # Pillow turns TIFFs, and no others.
@@ -185,19 +175,6 @@ def read_pixels(path: Path) -> np.ndarray:
     return pixels
 
 
-def _check_supported(path: Path, image: Image.Image) -> None:
-    if image.width * image.height > MAX_PIXELS:
-        raise UserError(
-            f"{path}: must have at most {MAX_PIXELS:,} pixels, got {image.width} x "
-            f"{image.height}; scale the images down"
-        )
-    if image.mode not in (*BITS, "P", "1"):
-        raise UserError(
-            f"{path}: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of Pillow's "
-            f"mode {image.mode}; convert it"
-        )
-
-
 @contextmanager
 def _open_image(path: Path) -> Iterator[ImageFile.ImageFile]:
     """Open an image without decoding it; errors within the block become the user's."""
@@ -211,6 +188,16 @@ def _open_image(path: Path) -> Iterator[ImageFile.ImageFile]:
                 "convert it"
             ) from None
         with image:
+            if image.width * image.height > MAX_PIXELS:
+                raise UserError(
+                    f"{path}: must have at most {MAX_PIXELS:,} pixels, got {image.width} x "
+                    f"{image.height}; scale the images down"
+                )
+            if image.mode not in (*BITS, "P", "1"):
+                raise UserError(
+                    f"{path}: must be a grey, RGB or RGBA image of 8 or 16 bits, got one of "
+                    f"Pillow's mode {image.mode}; convert it"
+                )
             yield image
 
 

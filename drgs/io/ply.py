@@ -36,7 +36,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty
 from typing_extensions import override
 
-from drgs.core.errors import UserError, UserNote, format_names, one_line
+from drgs.core.errors import UserError, format_names, note_user, one_line
 from drgs.core.files import open_regular, refuse_damage
 from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD, recenter_means
@@ -164,10 +164,7 @@ def encode_elements(
 
 
 def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None.
-
-    Raises :class:`UserError` as :func:`read_elements`.
-    """
+    """Return positions (N, 3) float64, world, and colours (N, 3) float32 in 0..1, or None."""
     rows, statements = read_elements(path, ["vertex"])
     vertex = rows["vertex"]
     _require(path, vertex, POSITION, "points")
@@ -186,12 +183,9 @@ def read_points(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def has_packed_vertices(path: str | Path) -> bool:
-    """Return whether a PLY file is one of :mod:`drgs.io.compressed_ply`.
-
-    Raises :class:`UserError` for an invalid header.
-    """
+    """Return whether a PLY file is one of :mod:`drgs.io.compressed_ply`."""
     with _open_after_header(path) as (_, header):
-        names = [p.name for each in header.elements for p in each.properties]
+        names = [p.name for each in header.ply.elements for p in each.properties]
         return "chunk" in header.counts and "packed_position" in names
 
 
@@ -207,10 +201,10 @@ def read_elements(
     of ``names`` must have numbers only.
     """
     with _open_after_header(path) as (file, header):
-        elements = list(takewhile(_has_numbers_only, header.elements))
+        elements = list(takewhile(_has_numbers_only, header.ply.elements))
         size = sum(header.counts[each.name] * each.dtype().itemsize for each in elements)
         require_memory(path, MEMORY_RATIO * size, header.expected_rows)
-        lines = io.TextIOWrapper(file, "ascii") if header.text else None
+        lines = io.TextIOWrapper(file, "ascii") if header.ply.text else None
         rows = {each.name: _read_rows(lines or file, header, each) for each in elements}
         for name in ("vertex", *(name for name in names if name in header.counts)):
             if not len(rows.get(name, ())):
@@ -218,8 +212,8 @@ def read_elements(
                     f"{path}: element {name} must have at least 1 row, no lists, and come before "
                     f"elements that have; the file has {header.expected_rows}"
                 )
-        rest = "" if len(elements) < len(header.elements) else (lines or file).read()
-        if num_left := len(rest.strip() if header.text else rest):
+        rest = "" if len(elements) < len(header.ply.elements) else (lines or file).read()
+        if num_left := len(rest.strip() if header.ply.text else rest):
             raise UserError(
                 f"{path}: the file must end after the rows that its header promises "
                 f"({header.expected_rows}), got {num_left:,} bytes more; correct the header's "
@@ -232,11 +226,9 @@ def read_elements(
 class _Header:
     """Content of a header; its elements have no rows."""
 
-    elements: tuple[PlyElement, ...]
+    ply: PlyData
     counts: dict[str, int]  # promised rows, by element
     statements: dict[str, Scalar]
-    text: bool
-    byte_order: str  # NumPy's: < or >
     end: int  # byte: of the file
 
     @property
@@ -271,7 +263,7 @@ def _read_header(path: str | Path, file: IO[bytes]) -> _Header:
             if not 0 <= counts[name] <= size:  # refused before memory is allocated
                 _refuse_end(name, counts[name], size)
     ply = PlyData.read(io.BytesIO(b"\n".join([*lines, b"end_header", b""])))
-    return _Header(ply.elements, counts, _statements(path, lines), ply.text, ply.byte_order, size)
+    return _Header(ply, counts, _statements(path, lines), size)
 
 
 def _has_numbers_only(element: PlyElement) -> bool:
@@ -282,7 +274,7 @@ def _read_rows(
     file: IO[bytes] | io.TextIOWrapper, header: _Header, element: PlyElement
 ) -> np.ndarray:
     """Read the rows of an element from a binary file, or from the lines of a text."""
-    count, dtype = header.counts[element.name], element.dtype(header.byte_order)
+    count, dtype = header.counts[element.name], element.dtype(header.ply.byte_order)
     if isinstance(file, io.TextIOWrapper):
         with warnings.catch_warnings():  # of no rows, which are refused
             warnings.simplefilter("ignore")
@@ -332,11 +324,10 @@ def _scalar(text: str) -> Scalar:
 def _finite_logits(path: str | Path, logits: np.ndarray) -> np.ndarray:
     """Return logits with infinite ones at the limits of float32's sigmoid."""
     if count := np.count_nonzero(np.isinf(logits)):
-        note = (
+        note_user(
             f"{path}: {count:,} of {len(logits):,} opacities are infinite logits, as formats of 8 "
             f"bits leave them for 1 and 0; read as {MAX_LOGIT:.2f} and {MIN_LOGIT:.2f}"
         )
-        warnings.warn(UserNote(note), stacklevel=2)
     largest, smallest = float(np.float32(MAX_LOGIT)), float(np.float32(MIN_LOGIT))
     return np.nan_to_num(logits, nan=np.nan, posinf=largest, neginf=smallest)
 

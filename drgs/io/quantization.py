@@ -68,6 +68,23 @@ def sh0_from_colors(colors: np.ndarray) -> np.ndarray:
     return ((colors - 0.5) / SH_C0)[:, None, :]
 
 
+def arrays_from_activated(
+    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the arrays of :data:`drgs.io.formats.Arrays` from values as they are seen.
+
+    quats: (N, 4) wxyz; scales: (N, 3) standard deviations; opacities: (N,); sh: (N, K, 3).
+    """
+    return {
+        "means": means,
+        "quats": quats,
+        "log_scales": log_scales_from_scales(scales),
+        "logit_opacities": logits_from_opacities(opacities),
+        "sh0": sh[:, :1],
+        "shN": sh[:, 1:],
+    }
+
+
 def normalize_quaternions(quats: np.ndarray) -> np.ndarray:
     """Return quaternions (N, 4) wxyz, float64, of length 1; one of length 0 is the identity."""
     quats = quats.astype(np.float64)
@@ -95,14 +112,6 @@ def restore_largest_component(index: np.ndarray, others: np.ndarray) -> np.ndarr
 
 MORTON_BITS = 21  # per axis: a cell is half a millionth of the box's longest side
 
-_SPREAD = (
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
-
 
 def morton_order(positions: np.ndarray) -> np.ndarray:
     """Return indices (N,) that sort positions (N, 3) along the Z-order curve; ties by index.
@@ -113,12 +122,8 @@ def morton_order(positions: np.ndarray) -> np.ndarray:
     low = positions.min(axis=0, initial=np.inf)
     side = (positions - low).max(initial=0) or 1.0
     cells = ((positions - low) / side * (2**MORTON_BITS - 1)).astype(np.uint64)
-    x, y, z = (_spread(cells[:, axis]) for axis in range(3))
-    return np.argsort(x | y << np.uint64(1) | z << np.uint64(2), kind="stable")
-
-
-def _spread(values: np.ndarray) -> np.ndarray:
-    """Insert two zero bits before each bit but the first."""
-    for shift, mask in _SPREAD:
-        values = (values | values << np.uint64(shift)) & np.uint64(mask)
-    return values
+    code = np.zeros(len(positions), np.uint64)
+    for place in range(3 * MORTON_BITS):
+        bit, axis = divmod(place, 3)
+        code |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(place)
+    return np.argsort(code, kind="stable")

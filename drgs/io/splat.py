@@ -18,9 +18,8 @@ from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
 from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar, check_range
 from drgs.io.quantization import (
+    arrays_from_activated,
     colors_from_sh0,
-    log_scales_from_scales,
-    logits_from_opacities,
     normalize_quaternions,
     opacities_from_logits,
     require_scene_memory,
@@ -56,15 +55,9 @@ class Splat(FileFormat):
         require_scene_memory(path, len(rows), 1)
         check_range(path, "mean", rows["mean"], -MAX_NUMBER, MAX_NUMBER)
         check_range(path, "scale", rows["scale"], 0, MAX_NUMBER)
-        arrays = {
-            "means": rows["mean"],
-            "quats": rows["quat"].astype(np.float64) / 128 - 1,
-            "log_scales": log_scales_from_scales(rows["scale"]),
-            "logit_opacities": logits_from_opacities(rows["rgba"][:, 3] / 255),
-            "sh0": sh0_from_colors(rows["rgba"][:, :3] / 255),
-            "shN": np.zeros((len(rows), 0, 3)),
-        }
-        return arrays, {}
+        quats, rgba = rows["quat"].astype(np.float64) / 128 - 1, rows["rgba"] / 255
+        sh0 = sh0_from_colors(rgba[:, :3])
+        return arrays_from_activated(rows["mean"], quats, rows["scale"], rgba[:, 3], sh0), {}
 
     @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:

@@ -24,7 +24,6 @@ from __future__ import annotations
 import gzip
 import io
 import struct
-import warnings
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -34,7 +33,7 @@ import numpy as np
 from typing_extensions import override
 
 from drgs.core.environment import require_module
-from drgs.core.errors import Place, UserError, UserNote, one_line
+from drgs.core.errors import Place, UserError, note_user, one_line
 from drgs.core.files import read_bytes
 from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
 from drgs.io.quantization import (
@@ -106,11 +105,10 @@ class Spz(FileFormat):
                 "not an SPZ file"
             )
         if header.degree > MAX_DEGREE:
-            note = f"harmonics of degree {header.degree}: read to degree {MAX_DEGREE}"
-            warnings.warn(UserNote(f"{path}: {note}"), stacklevel=2)
+            note_user(f"{path}: harmonics of degree {header.degree}: read to degree {MAX_DEGREE}")
         if header.flags & EXTENSIONS:
             note = "has extensions of a vendor, which are passed over; one may mean other axes"
-            warnings.warn(UserNote(f"{path}: {note}"), stacklevel=2)
+            note_user(f"{path}: {note}")
         positions, opacities, colors, scales, rotations, harmonics = (
             np.frombuffer(part, "u1").reshape(header.num, -1) if part else np.zeros((header.num, 0))
             for part in parts
@@ -166,7 +164,7 @@ def _check_scales(log_scales: np.ndarray) -> None:
     )
     if 2 * outside > len(largest):
         raise UserError(f"{what}; scale the scene, or choose another format")
-    warnings.warn(UserNote(f"{what}: cut off"), stacklevel=2)
+    note_user(f"{what}: cut off")
 
 
 def _fractional_bits(means: np.ndarray) -> int:

@@ -9,7 +9,6 @@ read as well; a prim may be moved, but not turned or scaled.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from functools import partial
 from importlib import import_module
@@ -22,23 +21,13 @@ from numpy.typing import ArrayLike
 from typing_extensions import override
 
 from drgs.core.environment import require_module
-from drgs.core.errors import UserError, UserNote, one_line
+from drgs.core.errors import UserError, note_user, one_line
 from drgs.core.files import refuse_damage
 from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD
-from drgs.io.formats import (
-    FORMATS,
-    ORIGIN,
-    UP,
-    Arrays,
-    FileFormat,
-    Scalar,
-    check_range,
-    pop_origin,
-)
+from drgs.io.formats import FORMATS, ORIGIN, UP, Arrays, FileFormat, Scalar, check_range, pop_origin
 from drgs.io.quantization import (
-    log_scales_from_scales,
-    logits_from_opacities,
+    arrays_from_activated,
     normalize_quaternions,
     opacities_from_logits,
     require_scene_memory,
@@ -125,7 +114,7 @@ def _read_stage(
     space = Usd.ColorSpaceAPI(prims[0]).GetColorSpaceNameAttr().Get()
     if space not in (None, "", COLOR_SPACE):
         note = f"colours of the space {one_line(space, 40)} are read as of {COLOR_SPACE}"
-        warnings.warn(UserNote(f"{place}: {note}"), stacklevel=2)
+        note_user(f"{place}: {note}")
     to_world = UsdGeom.Xformable(prims[0]).ComputeLocalToWorldTransform(time)
     origin = to_world.ExtractTranslation()
     if to_world != Gf.Matrix4d().SetTranslate(origin):
@@ -147,14 +136,8 @@ def _read_stage(
         )
     require_scene_memory(path, num, per_gaussian, turned=True)
     harmonics = harmonics.reshape(num, per_gaussian, 3)
-    arrays = {
-        "means": means,
-        "quats": np.roll(quats_xyzw, 1, axis=1),
-        "log_scales": log_scales_from_scales(scales),
-        "logit_opacities": logits_from_opacities(opacities),
-        "sh0": harmonics[:, :1],
-        "shN": harmonics[:, 1:],
-    }
+    quats = np.roll(quats_xyzw, 1, axis=1)
+    arrays = arrays_from_activated(means, quats, scales, opacities, harmonics)
     rendered_with: dict[str, Scalar] = {UP: UsdGeom.GetStageUpAxis(stage).lower()}
     if tuple(origin) != WORLD:
         rendered_with |= zip(ORIGIN, map(float, origin), strict=True)

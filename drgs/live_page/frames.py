@@ -109,11 +109,7 @@ class LiveScene:
         return self._model.approximations
 
     def frame(self, request: FrameRequest) -> ViewerFrame:
-        """Render a frame.
-
-        Raises :class:`drgs.core.errors.UserError` for incompatible settings, such as an exact
-        projection through a distorting lens.
-        """
+        """Render a frame, or raise ``UserError`` for settings that do not fit together."""
         return FRAME_CONTENTS[request.content](self, request)
 
     def image(self, request: FrameRequest, aovs: str = "") -> tuple[np.ndarray, float]:
@@ -139,9 +135,7 @@ class LiveScene:
         return scene
 
 
-# ----------------------------------------------------------------------------------------------
 # Frame contents
-# ----------------------------------------------------------------------------------------------
 
 
 def _color(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
@@ -206,14 +200,12 @@ def to_bytes(image: np.ndarray) -> np.ndarray:
 
 
 def over_backdrop(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Return (H, W, 3) uint8: colours (H, W, 3) with ``alpha`` (H, W) over :data:`BACKDROP`."""
+    """Return (H, W, 3) uint8: colours (H, W, 3) with ``alpha`` (H, W) over grey."""
     alpha = alpha[:, :, None]
     return to_bytes(alpha * colors + (1 - alpha) * BACKDROP_GRAY)
 
 
-# ----------------------------------------------------------------------------------------------
 # Lenses
-# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,6 @@ def run_server(port: int | None, option: str) -> Iterator[LocalServer]:
     """Run a server with an empty page within the block.
 
     port: None for the first free one from 8080 on; option: its name on the command line.
-
-    Raises :class:`UserError` if it cannot listen there.
     """
     if port is not None:
         _check_free(port, option)

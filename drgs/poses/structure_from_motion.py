@@ -33,7 +33,7 @@ from drgs.datasets.colmap import find_model
 from drgs.datasets.files import is_image, masks_of, without_masks
 from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
-from drgs.io.images import check_readable, image_size, write_png
+from drgs.io.images import image_size, read_header, write_png
 from drgs.poses.child_process import ChildEndedError, run_in_child
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def photographs_in(folder: Path) -> tuple[Path, list[str]]:
         note = f"{photographs}: left out, as COLMAP does not read them: {others}"
         warnings.warn(UserNote(note), stacklevel=2)
     for file in files:
-        check_readable(file)  # a fit would refuse it after hours of work
+        read_header(file)  # a fit would refuse it after hours of work
         if os.fsencode(file) != str(file).encode(errors="replace"):
             raise UserError(f"{file}: COLMAP knows names in UTF-8 only; rename it")
     return photographs, [file.relative_to(photographs).as_posix() for file in files]

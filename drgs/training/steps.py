@@ -16,8 +16,7 @@ import numpy as np
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import Array
 from drgs.core.types import Array2f, Bool, Float, TensorXf, UInt32
-from drgs.datasets.images import shift_pixels, smaller_view
-from drgs.datasets.storage import is_on_disk
+from drgs.datasets.images import is_on_disk, shift_pixels, smaller_view
 from drgs.datasets.types import View
 from drgs.effects.base import TrainingEffect
 from drgs.integrator.scene import make_sensors

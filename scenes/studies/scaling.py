@@ -24,7 +24,6 @@ import numpy as np
 from drgs.bench.output import columns_table, machine, markdown_table
 from drgs.bench.scenes import bench_camera, bench_gaussians
 from drgs.bench.timing import seconds
-from drgs.core.private import clear_memory_peak, memory_peak
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.history import write_csv
 from stages import STAGES, Scene, Work, clocked_step, count_work, frame_of, steps, warm_trainer
@@ -172,9 +171,9 @@ def measure(point: Point, num_steps: int) -> Result:
     scene = Scene("bench", replace(gaussians, log_scales=shrunk), bench_camera(point.size))
     work = count_work(frame_of(scene))
     trainer = warm_trainer(scene)
-    clear_memory_peak()
+    dr.detail.malloc_clear_statistics()
     times = [seconds(lambda: steps(trainer, 1)) for _ in range(num_steps)]
-    device_bytes = memory_peak()
+    device_bytes = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
     clocks = [clocked_step(trainer) for _ in range(num_steps)]
     return Result(
         point=point,

@@ -69,7 +69,7 @@ WRONG_WORDS = [
     (("", "--data", "nowhere"), "data.path: there is no folder"),
     (("", "--set", "data.imagesize=3"), "did you mean data.image_size?"),
     (("", "-D", "model=x.ply"), "--define: is not used with Gaussians"),
-    (("", "--threads", 2**32), "argument --threads: must be at most 4,096 (no machine has more"),
+    (("", "--threads", 2**32), "argument --threads: must be at most 4,096, got"),
 ]
 
 

@@ -107,12 +107,3 @@ def test_avx512_can_be_disabled():
         assert result.split() == ["True", "False", "True"]
     else:
         assert "cannot leave out AVX-512" in result and "omit it" in result
-
-
-def test_memory_peak_is_measured_since_the_last_reset():
-    private.clear_memory_peak()
-    before = private.memory_peak()
-    held = dr.full(Float, 1.0, 1 << 22)
-    dr.make_opaque(held)
-    assert dr.width(held) == 1 << 22
-    assert private.memory_peak() >= before + 4 * (1 << 22)

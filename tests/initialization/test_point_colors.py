@@ -15,8 +15,8 @@ from support.analytic_shapes import (
 )
 
 from drgs.cameras.viewpoints import CameraMotion
-from drgs.initialization import point_colors
-from drgs.initialization.point_colors import colors_from_images
+from drgs.initialization import start
+from drgs.initialization.start import colors_from_images
 
 COUNT, RADIUS = 1000, 0.8
 BALL = images_of(sphere(RADIUS), 16)
@@ -84,7 +84,7 @@ def test_points_that_no_image_shows_have_no_colours(views):
 
 
 def test_few_views_are_used_for_very_many_points(monkeypatch):
-    monkeypatch.setattr(point_colors, "MAX_BYTES", 12 * COUNT * 9)
+    monkeypatch.setattr(start, "MAX_COLOR_BYTES", 12 * COUNT * 9)
     # Colours of every other view are those of all: the others are not looked at.
     expected = colors_of(BALL[::2])
     np.testing.assert_array_equal(colors_of(BALL), expected)

@@ -40,8 +40,9 @@ def test_written_models_are_read_back(tmp_path, model, write):
         # Numbers up to 4, written as a quaternion: a few roundings.
         np.testing.assert_allclose(image.camera_to_world, pose, atol=1e-14)
     columns = zip(*model.points, strict=True)
-    for values, expected in zip(vars(read(tmp_path)).values(), columns, strict=True):
-        assert values.tolist() == np.array(expected).tolist()
+    points = read(tmp_path)
+    for name, expected in zip(points.dtype.names, columns, strict=True):
+        assert points[name].tolist() == np.array(expected).tolist()
 
 
 @each_format
@@ -84,7 +85,8 @@ def assert_as_colmap_reads(pycolmap, folder):
         assert image.camera == poses[image.name].camera_id
     points = list(expected.points3D.values())
     theirs = np.array([[*p.xyz, *p.color, p.error, p.track.length()] for p in points])
-    ours = np.column_stack(list(vars(read(folder)).values()))
+    found = read(folder)
+    ours = np.column_stack([found[name] for name in found.dtype.names])
     theirs, ours = (table[np.lexsort(table.T)] for table in (theirs.reshape(-1, 8), ours))
     np.testing.assert_allclose(ours, theirs, rtol=1e-12)
 

@@ -30,7 +30,7 @@ def installed(monkeypatch, tmp_path):
     (folder / EXAMPLE.name).write_bytes(EXAMPLE.read_bytes())
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: drgs-npz\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[drgs]\nnpz = npz_format\n")
-    formats.file_formats()  # imports those that are shipped
+    formats.readable_formats()  # imports those that are shipped
     monkeypatch.syspath_prepend(folder)
     with mock.patch.dict(sys.modules), registry.temporary_registrations():
         yield folder

@@ -12,7 +12,7 @@ from support.small_capture import blobs
 from drgs.core.errors import UserNote
 from drgs.core.origin import MAX_SCENE_SIZES, WORLD, choose_origin
 from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.similarity import rotation_towards
+from drgs.gaussians.similarity import Similarity, shortest_rotation
 from drgs.io.ply import read_points
 
 EARTH = (4200000.0, 170000.5, -4780000.25)
@@ -104,7 +104,8 @@ def test_origin_must_be_three_numbers(tmp_path, x):
 
 def test_rotation_applies_to_origin_means_and_quats():
     far = replace(blobs(), origin=EARTH)
-    turned = rotation_towards(far, np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
+    turn = shortest_rotation(np.array([0.0, -1, 0]), np.array([0.0, 0, 1]))
+    turned = Similarity(1.0, turn, np.zeros(3)).of_gaussians(far)
     rotation = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # -y becomes z
     np.testing.assert_allclose(world(turned), world(far) @ rotation.T, atol=1e-5)
     before = Rotation.from_quat(far.quats, scalar_first=True)

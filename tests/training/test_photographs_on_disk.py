@@ -18,8 +18,8 @@ from support.fit_command import VALUES, assert_fits, run_fit, write_project
 from drgs import train
 from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.core.errors import UserError
-from drgs.datasets import images, storage
-from drgs.datasets.storage import DiskStore, is_on_disk
+from drgs.datasets import images
+from drgs.datasets.images import DiskStore, is_on_disk
 from drgs.fit import memory
 from drgs.training.steps import NUM_AHEAD, view_of
 from drgs.training.trainer import Trainer
@@ -176,13 +176,13 @@ def no_disk(monkeypatch):
 
 
 def full_disk(monkeypatch):
-    monkeypatch.setattr(storage.shutil, "disk_usage", lambda _: Mock(free=1000))
+    monkeypatch.setattr(images.shutil, "disk_usage", lambda _: Mock(free=1000))
 
 
 def failing_file(monkeypatch, method, error):
     """A temporary file with a method that fails."""
     file = Mock(**{"seek.return_value": 0, f"{method}.side_effect": error})
-    monkeypatch.setattr(storage.tempfile, "TemporaryFile", lambda **_: file)
+    monkeypatch.setattr(images.tempfile, "TemporaryFile", lambda **_: file)
 
 
 def full_while_writing(monkeypatch):
@@ -193,7 +193,7 @@ def read_only(monkeypatch):
     def refuse(**_):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr(storage.tempfile, "TemporaryFile", refuse)
+    monkeypatch.setattr(images.tempfile, "TemporaryFile", refuse)
 
 
 def little_memory(monkeypatch):
