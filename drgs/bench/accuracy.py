@@ -267,10 +267,6 @@ class RungRenderer:
         dr.eval(gradients.parameters)
         dr.sync_thread()
 
-    def operations(self) -> int:
-        """Count the operations in the kernels of a forward pass."""
-        return count_operations(self.frame)
-
 
 def most_accurate(
     subject: Subject,
@@ -306,7 +302,7 @@ def measure(
 ) -> list[AccuracyMeasurement]:
     """Measure errors of all rungs, and their times on the first view, in turns."""
     renderers = [RungRenderer.from_rung(rung, subject, subject.cameras[0]) for rung in rungs]
-    operations = [renderer.operations() for renderer in renderers]  # compiles the kernels
+    operations = [count_operations(each.frame) for each in renderers]  # compiles the kernels
     times = time_in_turns([(each.frame, each.forward_backward) for each in renderers], rounds)
     results = []
     for rung, count, spent in zip(rungs, operations, times, strict=True):

@@ -10,21 +10,20 @@ marks, are excluded.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
 import drjit.llvm.ad as llvm
 import numpy as np
 
-from drgs.bench.output import add_out, columns_table, machine
+from drgs.bench.output import add_out, columns_table, machine, write_rows
 from drgs.bench.scenes import device_camera
 from drgs.cli.commands import CommandParser
 from drgs.core.types import Float
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import splatting as reference
-from drgs.results.history import write_csv
 from drgs.splatting import rendering
 
 if TYPE_CHECKING:
@@ -52,6 +51,7 @@ class Sweep:
 class StabilityMeasurement:
     """Errors at one step of a sweep, relative to each array's largest value."""
 
+    sweep: str
     value: float
     image: float  # largest error of any pixel
     image_noise: float
@@ -80,16 +80,15 @@ def add_arguments(parser: CommandParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Measure all sweeps; print tables, write CSV and plot."""
     samples = 4 if args.quick else 12
-    results = {}
+    results = []
     print(f"float32 kernels against the float64 reference; {machine()}")
     for sweep in sweeps():
         values = sweep.values[:: 3 if args.quick else 1]
-        results[sweep.name] = [measure(sweep, value, samples) for value in values]
+        steps = [measure(sweep, value, samples) for value in values]
         columns = [(sweep.axis, "{.value:g}"), *ERRORS]
-        print(f"\n{sweep.name}\n{columns_table(columns, results[sweep.name])}", flush=True)
-    columns = list(StabilityMeasurement.__dataclass_fields__)
-    rows = [[name, *vars(m).values()] for name, steps in results.items() for m in steps]
-    write_csv(args.out / "stability.csv", ["sweep", *columns], rows)
+        print(f"\n{sweep.name}\n{columns_table(columns, steps)}", flush=True)
+        results += steps
+    write_rows(args.out / "stability.csv", StabilityMeasurement, results)
     write_figure(args.out / "stability.png", plot(results))
 
 
@@ -213,6 +212,7 @@ def measure(sweep: Sweep, value: float, samples: int) -> StabilityMeasurement:
         errors.append([image_error(perturbed[0]), gradient_error(perturbed[1])])
     image_noise, gradient_noise = np.sqrt(np.mean(np.square(errors), axis=0)).tolist()
     return StabilityMeasurement(
+        sweep=sweep.name,
         value=value,
         image=image_error(image32),
         image_noise=image_noise,
@@ -273,12 +273,12 @@ def _by_kernels(
     return image, {name: np.array(getattr(gradients, name)) for name in PARAMETER_NAMES}
 
 
-def plot(results: dict[str, list[StabilityMeasurement]]) -> Figure:
+def plot(results: Sequence[StabilityMeasurement]) -> Figure:
     """Plot a panel per sweep: errors as lines, their noise dashed in the same colour."""
     figure = new_figure(11, 6)
     axes = figure.subplots(2, 2, sharey=True).ravel()
     for panel, sweep in zip(axes, sweeps(), strict=True):
-        steps = results[sweep.name]
+        steps = [m for m in results if m.sweep == sweep.name]
         x = [m.value for m in steps]
         for color, what, label in (
             ("tab:blue", "image", "image"),

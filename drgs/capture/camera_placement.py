@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from drgs.cameras.axes import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA
 from drgs.cameras.viewpoints import look_at
 from drgs.capture.path_tracing import (
-    FAR_CLIP,
     MIN_LIT_PART,
     SPLITS,
     CaptureCamera,
@@ -247,16 +246,8 @@ def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.
     """
     low, high = bounding_box(scene)
     target = (low + high) / 2 if settings.target is None else np.array(settings.target)
-    diagonal = float(np.linalg.norm(high - low))
-    distance = settings.distance
-    if distance is None:
-        distance = diagonal / 2 / math.sin(settings.narrower_fov / 2)
-    if math.dist(target.tolist(), ((low + high) / 2).tolist()) + distance > FAR_CLIP * diagonal:
-        raise UserError(
-            f"no camera may be farther from the scene than {FAR_CLIP:g} of its diagonals, "
-            f"{FAR_CLIP * diagonal:g}; got target {target.tolist()} and distance {distance:g}"
-        )
-    return target, distance
+    radius = float(np.linalg.norm(high - low)) / 2
+    return target, settings.distance or radius / math.sin(settings.narrower_fov / 2)
 
 
 def views_around(

@@ -34,7 +34,7 @@ from drgs.capture.path_tracing import (
 )
 from drgs.cli.progress import RunProgress
 from drgs.core.errors import UserError, one_line
-from drgs.core.files import atomic_path, read_text, remove_stale_temporaries
+from drgs.core.files import atomic_path, read_text, remove_stale_temporaries, write_json
 from drgs.io.images import read_image, to_uint8, write_png
 from drgs.io.ply import COLOR, POSITION, encode_elements
 
@@ -100,8 +100,7 @@ class CaptureFolder:
         self._keep()
         self.check()
         if self._is_empty():
-            with atomic_path(self.path / MANIFEST) as temporary:
-                temporary.write_text(json.dumps(self._manifest, indent=2) + "\n")
+            write_json(self.path / MANIFEST, self._manifest, indent=2)
         remove_stale_temporaries(self.path)
 
     def _is_empty(self) -> bool:
@@ -232,9 +231,7 @@ def write_transforms(path: Path, settings: CaptureSettings, views: list[CaptureV
         | ({} if view.fov == settings.fov else {"camera_angle_x": view.fov})
         for view in views
     ]
-    with atomic_path(path) as temporary:
-        content = {"camera_angle_x": settings.fov, "frames": frames}
-        temporary.write_text(json.dumps(content, indent=1) + "\n")
+    write_json(path, {"camera_angle_x": settings.fov, "frames": frames})
 
 
 def write_points(path: Path, positions: np.ndarray, colors: np.ndarray) -> None:

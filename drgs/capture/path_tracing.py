@@ -27,6 +27,7 @@ import numpy as np
 from drgs.cameras.axes import OPENGL_TO_MITSUBA
 from drgs.core.errors import UserError, one_line, reason_of_mitsuba
 from drgs.core.types import Bool
+from drgs.integrator.scene import film_description
 from drgs.integrator.state import is_splats
 from drgs.io.images import to_uint8
 from drgs.io.scenes import load_scene_dictionary, load_scene_file
@@ -234,19 +235,11 @@ class CaptureCamera:
                 # Rays start at the near plane: nothing in front of a camera is left out.
                 "near_clip": NEAR_CLIP * diagonal,
                 "far_clip": FAR_CLIP * diagonal,
-                "film": {
-                    "type": "hdrfilm",
-                    "width": settings.size[0],
-                    "height": settings.size[1],
-                    "pixel_format": "rgba",
-                    "component_format": "float32",
-                    "rfilter": {"type": "box"},
-                },
+                "film": film_description(*settings.size) | {"pixel_format": "rgba"},
                 "sampler": {"type": "multijitter"},
             }
         )
         self._parameters = mi.traverse(self._sensor)
-        self._fov = settings.fov
 
     def image(self, view: CaptureView) -> np.ndarray:
         """Return (H, W, 4) uint8: straight alpha, colour in display space."""
@@ -260,9 +253,7 @@ class CaptureCamera:
         """Return (H, W, 4) float64: radiance times alpha, and alpha."""
         to_world = view.pose @ OPENGL_TO_MITSUBA
         self._parameters["to_world"] = mi.Transform4f(to_world)
-        if view.fov != self._fov:
-            self._parameters["x_fov"] = mi.Float(math.degrees(view.fov))
-            self._fov = view.fov
+        self._parameters["x_fov"] = mi.Float(math.degrees(view.fov))
         self._parameters.update()
         (width, height), spp = self._settings.size, self._settings.spp
         at_once = min(SAMPLES_PER_PASS, math.isqrt(PATHS_PER_PASS // (width * height)) ** 2)

@@ -30,7 +30,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError, one_line
 from drgs.datasets.images import smaller_view, with_arrays
-from drgs.datasets.types import Dataset, View, evenly_spaced
+from drgs.datasets.types import Dataset, evenly_spaced
 from drgs.effects.base import Finding, Progress, ShortFit
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import Start, gaussians_at, start_of
@@ -58,21 +58,17 @@ BORDER_PX, BORDER_TOLERANCE, MIN_BORDER_SHARE = 2, 0.04, 0.6
 """A background of one colour: of each photograph's border, this share has it, but for this."""
 
 
-def _show_nothing(what: str, done: int, total: int) -> None:
-    del what, done, total
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Decision:
     """A row of the table: an effect, the evidence, and what a short fit has gained with it."""
 
     effect: str
     evidence: str
-    gain: float | None  # dB, mean over the held-out photographs; None: it was not tried
-    spread: float | None  # dB: standard error of this mean
-    cost: float | None  # time of iterations, relative to those without the effect
+    gain: float | None = None  # dB, mean over the held-out photographs; None: it was not tried
+    spread: float | None = None  # dB: standard error of this mean
+    cost: float | None = None  # time of iterations, relative to those without the effect
     changes: Mapping[str, object]  # values of the configuration that simulate it, by key
-    chosen: bool
+    chosen: bool = False
 
 
 @dataclass(frozen=True)
@@ -179,19 +175,19 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
     gains = fitted.psnr - without.psnr
     gain, spread = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains)))
     return Decision(
-        finding.effect,
-        finding.evidence,
-        gain,
-        spread,
-        fitted.wall_s / without.wall_s,
-        finding.changes,
+        effect=finding.effect,
+        evidence=finding.evidence,
+        gain=gain,
+        spread=spread,
+        cost=fitted.wall_s / without.wall_s,
+        changes=finding.changes,
         chosen=gain > max(MIN_GAIN_DB, spread * float(stdtrit(len(gains) - 1, CONFIDENCE))),
     )
 
 
 def _reject(finding: Finding, reason: str = "") -> Decision:
     evidence = finding.evidence + reason
-    return Decision(finding.effect, evidence, None, None, None, finding.changes, chosen=False)
+    return Decision(effect=finding.effect, evidence=evidence, changes=finding.changes)
 
 
 def _reason_not_examined(config: FitConfig, dataset: Dataset) -> str:
@@ -219,12 +215,9 @@ def split_views(dataset: Dataset) -> tuple[Dataset, int]:
     small = [with_arrays(smaller_view(view, factor)) for view in views]
     held_out = range(stride // 2, len(small), stride)
     train = tuple(view for index, view in enumerate(small) if index not in held_out)
-    test = tuple(view for view in (small[i] for i in held_out) if _has_pixels(view))
+    test = [small[index] for index in held_out]
+    test = tuple(view for view in test if view.mask is None or np.any(view.mask))
     return replace(dataset, train=train, test=test), factor
-
-
-def _has_pixels(view: View) -> bool:
-    return view.mask is None or bool(np.any(view.mask))
 
 
 def short_fit(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import astuple, replace
+from itertools import zip_longest
 
 import numpy as np
 
@@ -31,10 +32,15 @@ def add_cleaning_arguments(parser: CommandParser) -> None:
         metavar=corners,
         help="keep the Gaussians inside a box",
     )
-    add("--min-opacity", type=_opacity, metavar="P", help="remove less opaque Gaussians, 0 to 1")
+    add(
+        "--min-opacity",
+        type=finite_number,
+        metavar="P",
+        help="remove less opaque Gaussians, 0 to 1",
+    )
     add(
         "--max-size",
-        type=_size,
+        type=finite_number,
         metavar="S",
         help="remove Gaussians with a larger standard deviation, scene units",
     )
@@ -44,9 +50,9 @@ def add_cleaning_arguments(parser: CommandParser) -> None:
     ):
         add(
             f"--filter-{option}",
-            type=_VoxelOption(rule),
+            type=_voxel_rule(rule),
             nargs="?",
-            const=_VoxelOption(rule)(""),
+            const=_voxel_rule(rule)(""),
             metavar="SIZE,OPACITY,MIN",
             help=f"{text} of at least this opacity (default: {rule.size:g} of the median distance "
             f"from the middle, or more for large scenes; {rule.opacity:g}; {rule.contribution:g})",
@@ -68,39 +74,27 @@ def add_cleaning_arguments(parser: CommandParser) -> None:
     add_variant_argument(parser)
 
 
-def _opacity(text: str) -> float:
-    if not 0 <= (number := finite_number(text)) <= 1:
-        raise argparse.ArgumentTypeError(f"must be between 0 and 1, got {text}")
-    return number
+def _voxel_rule(default: VoxelRule) -> Callable[[str], tuple[VoxelRule, bool]]:
+    """Return a parser of ``SIZE,OPACITY,MIN``, of which any may be left out.
 
+    It returns the rule, and whether its size is given, in world units: the default's is relative.
+    """
 
-def _size(text: str) -> float:
-    if not (number := finite_number(text)) > 0:
-        raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
-    return number
-
-
-@dataclass(frozen=True)
-class _VoxelOption:
-    """A parser of ``SIZE,OPACITY,MIN``: what is left out is the default's, and SIZE is relative."""
-
-    default: VoxelRule
-
-    def __call__(self, text: str) -> tuple[VoxelRule, bool]:
-        """Return the rule, and whether its size is given, in world units."""
-        words, d = text.split(","), self.default
-        defaults = (d.size, d.opacity, d.contribution)
-        if len(words) > len(defaults):
+    def parse(text: str) -> tuple[VoxelRule, bool]:
+        words = text.split(",")
+        if len(words) > 3:
             got = one_line(text, 40)
             raise argparse.ArgumentTypeError(f"must be at most SIZE,OPACITY,MIN, got {got}")
-        given = [finite_number(w) if w else n for w, n in zip(words, defaults, strict=False)]
-        size, opacity, least = [*given, *defaults[len(given) :]]
+        pairs = zip_longest(words, astuple(default))
+        size, opacity, least = (finite_number(word) if word else usual for word, usual in pairs)
         if not (size > 0 and 0 < opacity < 1 and least >= 0):
             raise argparse.ArgumentTypeError(
                 "SIZE must be above 0, OPACITY above 0 and below 1, MIN at least 0, got "
                 f"{size:g},{opacity:g},{least:g}"
             )
         return VoxelRule(size, opacity, least), bool(words[0])
+
+    return parse
 
 
 def _count_or_percentage(text: str) -> Callable[[int], int]:

@@ -33,15 +33,13 @@ BETA_2 = 0.99  # of Adam: moments of the few iterations there are
 
 VIEWS_PER_RING, SIDE_PX = 16, 400  # of cameras around Gaussians that come without
 
-Rgb = tuple[float, float, float]
-
 
 def decimate(
     gaussians: Gaussians[np.ndarray],
     count: int,
     views: Sequence[Viewpoint],
     model: ModelConfig,
-    background: Rgb,
+    background: tuple[float, float, float],
 ) -> Gaussians[np.ndarray]:
     """Return at most ``count`` Gaussians that look alike from the ``views``.
 

@@ -6,7 +6,7 @@ neighbours. The cost is in closed form here instead of by sampling.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -69,8 +69,7 @@ def merge_down(gaussians: Gaussians[np.ndarray], count: int) -> Gaussians[np.nda
 
 def take(gaussians: Gaussians[np.ndarray], rows: np.ndarray) -> Gaussians[np.ndarray]:
     """Return some of the Gaussians; rows: indices, or a mask (N,)."""
-    values = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
-    arrays = {name: v[rows] for name, v in values.items() if isinstance(v, np.ndarray)}
+    arrays = {k: v[rows] for k, v in vars(gaussians).items() if isinstance(v, np.ndarray)}
     features = gaussians.features and {k: v[rows] for k, v in gaussians.features.items()}
     return replace(gaussians, **arrays, features=features)
 

@@ -27,12 +27,14 @@ axes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from math import inf, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import root_scalar
+from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
 from drgs.reference import splatting as reference
@@ -70,9 +72,7 @@ VIEW_MARGIN = 0.15
 """A camera samples what lies within its film, widened by this part of its size (Mip-Splatting)."""
 
 
-# ----------------------------------------------------------------------------------------------
-# Lenses
-# ----------------------------------------------------------------------------------------------
+# ---- Lenses ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -259,14 +259,18 @@ class Fisheye(Lens):
     @override
     def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         rho = np.linalg.norm(points[:, :2], axis=1)
-        theta = np.arctan2(rho, points[:, 2])
         # On the axis (x, y) = 0, whatever it is multiplied by.
-        theta_by_rho = theta / np.where(rho == 0, 1.0, rho)
-        polynomial = sum(
-            k * theta ** (2 * i) for i, k in enumerate([1.0, self.k1, self.k2, self.k3, self.k4])
-        )
-        spread = (polynomial * theta_by_rho)[:, None]
-        return camera.focal * spread * points[:, :2] + camera.principal
+        theta_by_rho = np.arctan2(rho, points[:, 2]) / np.where(rho == 0, 1.0, rho)
+        distorted = self.distort(theta_by_rho[:, None] * points[:, :2])
+        return camera.focal * distorted + camera.principal
+
+    def distort(self, places: np.ndarray) -> np.ndarray:
+        """Return (..., 2) places theta_d / theta (u, v) of places (u, v) = theta / rho (x, y).
+
+        They may be complex.
+        """
+        r2 = np.sum(places**2, axis=-1, keepdims=True)
+        return places * (1 + self.k1 * r2 + self.k2 * r2**2 + self.k3 * r2**3 + self.k4 * r2**4)
 
     @override
     def depths(self, camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -307,24 +311,14 @@ class ThinPrismFisheye(Fisheye):
     sy1: float = 0.0
 
     @override
-    def film_points(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        rho = np.linalg.norm(points[:, :2], axis=1)
-        theta_by_rho = np.arctan2(rho, points[:, 2]) / np.where(rho == 0, 1.0, rho)
-        distorted = self.distort(theta_by_rho[:, None] * points[:, :2])
-        return camera.focal * distorted + camera.principal
-
     def distort(self, places: np.ndarray) -> np.ndarray:
-        """Return (..., 2) places (u', v') of places (u, v) (..., 2), which may be complex."""
         u, v = places[..., 0], places[..., 1]
         r2 = u * u + v * v
-        q = 1 + self.k1 * r2 + self.k2 * r2**2 + self.k3 * r2**3 + self.k4 * r2**4
-        return np.stack(
-            [
-                u * q + 2 * self.p1 * u * v + self.p2 * (r2 + 2 * u * u) + self.sx1 * r2,
-                v * q + self.p1 * (r2 + 2 * v * v) + 2 * self.p2 * u * v + self.sy1 * r2,
-            ],
-            axis=-1,
-        )
+        tangential_and_prism = [
+            2 * self.p1 * u * v + self.p2 * (r2 + 2 * u * u) + self.sx1 * r2,
+            self.p1 * (r2 + 2 * v * v) + 2 * self.p2 * u * v + self.sy1 * r2,
+        ]
+        return super().distort(places) + np.stack(tangential_and_prism, axis=-1)
 
     @property
     @override
@@ -453,17 +447,17 @@ def _undistort(lens: OpenCV | ThinPrismFisheye, targets: np.ndarray, radius: flo
 @cache
 def _first_fold(lens: OpenCV | ThinPrismFisheye, radius: float) -> float:
     """Return the smallest r below ``radius`` with ``least_eigenvalue`` 0; ``radius``: none is."""
-    radii = np.geomspace(*FOLD_RADII, FOLD_STEPS)
+    radii = np.array([0.0, *np.geomspace(*FOLD_RADII, FOLD_STEPS)])
     radii = np.append(radii[radii < radius], radius * (1 - 1e-12)) if radius < inf else radii
     folded = np.flatnonzero(lens.least_eigenvalue(radii) <= 0)
     if len(folded) == 0:
         return radius
-    low, high = radii[max(folded[0] - 1, 0)], radii[folded[0]]
-    for _ in range(60):
-        middle = (low + high) / 2
-        is_folded = lens.least_eigenvalue(np.array([middle]))[0] <= 0
-        low, high = (low, middle) if is_folded else (middle, high)
-    return float(low)
+
+    def least_eigenvalue(r: float) -> float:
+        return lens.least_eigenvalue(np.array([r]))[0]
+
+    between = radii[folded[0] - 1], radii[folded[0]]
+    return float(root_scalar(least_eigenvalue, bracket=between, xtol=1e-15).root)
 
 
 def _film_border(camera: Camera) -> np.ndarray:
@@ -484,9 +478,7 @@ def _first_positive_root(coefficients: ArrayLike) -> float:
     return 1 / real.max() if (real > 0).any() else inf
 
 
-# ----------------------------------------------------------------------------------------------
-# Projection
-# ----------------------------------------------------------------------------------------------
+# ---- Projection ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -527,7 +519,7 @@ def project(
     an axis is r^2 / 4. Opacities are multiplied by sqrt(det(cov2d without r) / det(cov2d)), so
     that the integral over the film of a splat stays. So are ``Projection.cuts``: a splat that is
     seen in focus is seen out of focus, and ends at as many standard deviations. Both may be small,
-    but not below LEAST_CUT. ``Projection.depths`` are the lens's.
+    but not below MIN_CUT. ``Projection.depths`` are the lens's.
 
     Splats with a singular cov2d, which low_pass = 0 permits, are not visible.
 
@@ -604,9 +596,7 @@ def _points_of_jacobian(lens: Lens, camera: Camera, points: np.ndarray) -> np.nd
     return np.hstack([np.clip(points[:, :2] / z, lower - margin, upper + margin) * z, z])
 
 
-# ----------------------------------------------------------------------------------------------
-# Images
-# ----------------------------------------------------------------------------------------------
+# ---- Images ----------------------------------------------------------------------------------
 
 
 def sh_colors(
@@ -616,7 +606,6 @@ def sh_colors(
 
     degree: None for all that is stored.
     """
-    degree = gaussians.sh_degree if degree is None else degree
     directions = lens.view_directions(camera, gaussians.means)
     return np.maximum(reference.unclamped_colors(gaussians, directions, degree), 0.0)
 
@@ -637,11 +626,11 @@ def render(
     ``sh_colors``; threshold_width: see ``reference.composite``.
     """
     splats = project(gaussians, camera, lens, antialiased, defocus=defocus)
+    colors = sh_colors(gaussians, camera, lens, degree)
+    size = camera.width, camera.height
     return reference.composite(
-        splats.means2d, splats.conics, splats.opacities,
-        sh_colors(gaussians, camera, lens, degree), splats.depths, splats.visible,
-        background, camera.width, camera.height, threshold_width, splats.cuts, lens.period(camera),
-    )  # fmt: skip
+        splats, colors, background, *size, threshold_width, lens.period(camera)
+    )
 
 
 def lens_cameras(camera: Camera, defocus: ThinLens, num_samples: int) -> list[Camera]:
@@ -670,19 +659,7 @@ def _disc_points(count: int) -> np.ndarray:
     return radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def _mean_image(images: list[RenderedImage]) -> RenderedImage:
-    """Return the mean of images; a pixel that any of them marks as near a threshold is marked."""
-    means = {
-        name: np.mean([getattr(rendered, name) for rendered in images], axis=0)
-        for name in ("image", "alpha", "depth", "transmittance")
-    }
-    marked = np.any([rendered.near_threshold for rendered in images], axis=0)
-    return RenderedImage(**means, near_threshold=marked)
-
-
-# ----------------------------------------------------------------------------------------------
-# Cameras that move while they expose
-# ----------------------------------------------------------------------------------------------
+# ---- Cameras that move while they expose -----------------------------------------------------
 
 Pose = tuple[np.ndarray, np.ndarray]  # rotation (3, 3) world to camera, center (3,) world
 
@@ -695,32 +672,9 @@ def interpolate_pose(open: Pose, close: Pose, t: float) -> Pose:
     a turn apart there are two shortest arcs; which one is taken is not defined.
     """
     (rotation_open, center_open), (rotation_close, center_close) = open, close
-    w, *axis = _quat_of_rotation(rotation_close @ rotation_open.T)
-    half_angle = np.arctan2(np.linalg.norm(axis), w)
-    axis, _ = reference._normalize(np.array([axis]), fallback=(1.0, 0.0, 0.0))
-    quat = np.array([[np.cos(t * half_angle), *(np.sin(t * half_angle) * axis[0])]])
-    rotation = reference.quat_to_rotation(quat)[0] @ rotation_open
+    turn = Rotation.from_matrix(rotation_close @ rotation_open.T).as_rotvec()
+    rotation = Rotation.from_rotvec(t * turn).as_matrix() @ rotation_open
     return rotation, (1 - t) * center_open + t * center_close
-
-
-def _quat_of_rotation(rotation: np.ndarray) -> np.ndarray:
-    """Return the unit quaternion (4,), wxyz, w >= 0, of a rotation (3, 3).
-
-    With R(q) quadratic in q, trace(R(q)^T R) = q^T K q: the quaternion of R maximises it, and is
-    the eigenvector of K's largest eigenvalue (Bar-Itzhack, "New Method for Extracting the
-    Quaternion from a Rotation Matrix", JGCD 23(6), 2000). No case needs a division.
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    K = np.array(
-        [
-            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-        ]
-    )
-    quat = np.linalg.eigh(K).eigenvectors[:, -1]
-    return -quat if quat[0] < 0 else quat
 
 
 def camera_at(camera_open: Camera, camera_close: Camera, t: float) -> Camera:
@@ -743,15 +697,26 @@ def render_motion_blur(
     lens: Lens = Pinhole(),
     threshold_width: float = reference.THRESHOLD_WIDTH,
 ) -> RenderedImage:
-    """Return the mean of n = num_samples images, at the times (k + 0.5) / n of the exposure."""
-    times = (np.arange(num_samples) + 0.5) / num_samples
-    cameras = [camera_at(camera_open, camera_close, t) for t in times]
-    return _mean_image(
-        [
-            render(gaussians, camera, lens, background, threshold_width=threshold_width)
-            for camera in cameras
-        ]
-    )
+    """Return the mean of n = num_samples images, at the times (k + 0.5) / n of the exposure.
+
+    A pixel that any of them marks as near a threshold is marked.
+    """
+    images = [
+        render(
+            gaussians,
+            camera_at(camera_open, camera_close, (k + 0.5) / num_samples),
+            lens,
+            background,
+            threshold_width=threshold_width,
+        )
+        for k in range(num_samples)
+    ]
+    means = {
+        name: np.mean([getattr(rendered, name) for rendered in images], axis=0)
+        for name in ("image", "alpha", "depth", "transmittance")
+    }
+    marked = np.any([rendered.near_threshold for rendered in images], axis=0)
+    return RenderedImage(**means, near_threshold=marked)
 
 
 def render_rolling_shutter(
@@ -769,17 +734,11 @@ def render_rolling_shutter(
         )
         for j in range(height)
     ]
-    return RenderedImage(
-        **{
-            field.name: np.stack([getattr(p, field.name)[j] for j, p in enumerate(images)])
-            for field in fields(RenderedImage)
-        }
-    )
+    rows = ([field[j] for field in vars(rendered).values()] for j, rendered in enumerate(images))
+    return RenderedImage(*map(np.stack, zip(*rows, strict=True)))
 
 
-# ----------------------------------------------------------------------------------------------
-# The 3D smoothing filter
-# ----------------------------------------------------------------------------------------------
+# ---- The 3D smoothing filter -----------------------------------------------------------------
 
 
 def smoothing_filter(
@@ -819,9 +778,7 @@ def sampling_rates(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     return np.where(rates > 0, rates, rates[rates > 0].min(initial=inf))
 
 
-# ----------------------------------------------------------------------------------------------
-# Surfaces between the splats
-# ----------------------------------------------------------------------------------------------
+# ---- Surfaces between the splats -------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -845,37 +802,27 @@ def render_with_surfaces(
     composites is decided as without surfaces.
     """
     splats = reference.project(gaussians, camera)
-    colors = reference.sh_colors(gaussians, camera, gaussians.sh_degree)
     order = reference.depth_order(splats.depths, splats.visible)
-    shape = camera.height, camera.width
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    color, depth, coverage = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
-    seen, without = np.ones(shape), np.ones(shape)  # transmittance with and without surfaces
-    finished = np.zeros(shape, dtype=bool)
-    before = np.ones((len(surfaces), *shape))
-    passed = np.zeros((len(surfaces), *shape), dtype=bool)
+    colors, depths = reference.sh_colors(gaussians, camera)[order], splats.depths[order]
+    centers = reference.pixel_centers(camera.width, camera.height)
+    offsets = centers - splats.means2d[order, None, None]
+    exponents = -0.5 * np.einsum("nhwa,nab,nhwb->nhw", offsets, splats.conics[order], offsets)
+    alphas = splats.opacities[order, None, None] * np.exp(exponents)
+    alphas = np.minimum(np.where(alphas < reference.ALPHA_CUT, 0, alphas), reference.ALPHA_MAX)
+    unfinished = np.cumprod(1 - alphas, axis=0) >= reference.TRANSMITTANCE_STOP
+    alphas = np.where(unfinished, alphas, 0)
 
-    def pass_surfaces(behind: np.ndarray) -> np.ndarray:
-        """The transmittance behind the surfaces that a splat (of the mask ``behind``) is behind."""
-        through = seen
-        for k, (_, alpha) in enumerate(surfaces):
-            passes = behind[k] & ~passed[k]
-            before[k] = np.where(passes, without, before[k])
-            through = np.where(passes, through * (1 - alpha), through)
-            passed[k] |= behind[k]
-        return through
-
-    for i in order:
-        seen = pass_surfaces(np.array([splats.depths[i] > z for z, _ in surfaces]))
-        offset = np.stack([x, y], axis=-1) - splats.means2d[i]
-        exponent = -0.5 * np.einsum("...a,ab,...b", offset, splats.conics[i], offset)
-        alpha = np.minimum(splats.opacities[i] * np.exp(exponent), reference.ALPHA_MAX)
-        alpha = np.where(alpha < reference.ALPHA_CUT, 0, alpha)
-        finished |= (alpha > 0) & (without * (1 - alpha) < reference.TRANSMITTANCE_STOP)
-        alpha = np.where(finished, 0, alpha)
-        color += (seen * alpha)[..., None] * colors[i]
-        coverage += seen * alpha
-        depth += seen * alpha * splats.depths[i]
-        seen, without = seen * (1 - alpha), without * (1 - alpha)
-    seen = pass_surfaces(np.ones_like(passed))
-    return SurfaceImage(color, coverage, depth, before, seen)
+    through = np.cumprod(1 - alphas, axis=0) / (1 - alphas)  # the splats in front of each
+    before = []
+    for z, alpha in surfaces:
+        is_behind = depths[:, None, None] > z
+        before.append(np.prod(np.where(is_behind, 1, 1 - alphas), axis=0))
+        through = np.where(is_behind, through * (1 - alpha), through)
+    weights = through * alphas
+    return SurfaceImage(
+        color=np.einsum("nhw,nc->hwc", weights, colors),
+        coverage=np.sum(weights, axis=0),
+        depth=np.einsum("nhw,n->hw", weights, depths),
+        before=np.array(before),
+        transmittance=np.prod(1 - alphas, axis=0) * np.prod([1 - a for _, a in surfaces], axis=0),
+    )

@@ -51,49 +51,29 @@ def composite_segments(
     rotations = reference.quat_to_rotation(gaussians.quats)
     whitening = np.transpose(rotations, (0, 2, 1)) / np.exp(gaussians.log_scales)[:, :, None]
     opacities = reference.sigmoid(gaussians.logit_opacities)
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
-    passed = [
-        _composite_segment(
-            np.einsum("nij,nj->ni", whitening, origins[r] - gaussians.means),
-            whitening @ directions[r],
-            far[r],
-            opacities,
-            np.maximum(reference.unclamped_colors(gaussians, directions[r][None], degree), 0.0),
-            (alpha_max, alpha_cut, stop, close),
+    segments = []
+    for origin, direction, end in zip(origins, directions, far, strict=True):
+        # Origin from the means, and direction, in coordinates of unit Gaussians.
+        start = np.einsum("nij,nj->ni", whitening, origin - gaussians.means)
+        along = whitening @ direction
+        t = -np.sum(start * along, axis=1) / np.sum(along * along, axis=1)
+        squared = np.sum(np.square(start + t[:, None] * along), axis=1)
+        alphas = np.minimum(opacities * np.exp(-squared / 2), alpha_max)
+
+        seen = np.flatnonzero((alphas >= alpha_cut) & (t > 0) & (t < end))
+        seen = seen[np.argsort(t[seen], kind="stable")]
+        behind = np.cumprod(1 - alphas[seen])
+        count = np.count_nonzero(behind >= stop)  # it never rises
+        before, shown = np.array([1.0, *behind]), seen[:count]
+        unclamped = reference.unclamped_colors(gaussians, direction[None], sh_degree)
+        color = (before[:count] * alphas[shown]) @ np.maximum(unclamped[shown], 0.0)
+
+        near_ends = (np.abs(t) < close) | (np.abs(t - end) < close)
+        near_cut = (np.abs(alphas / alpha_cut - 1) < close) & (t > -close) & (t < end + close)
+        is_close = (
+            np.any(near_cut | (near_ends & (alphas > alpha_cut * (1 - close))))
+            or np.any(np.diff(t[seen]) < close)
+            or np.any(np.abs(behind[: count + 1] / max(stop, 1e-300) - 1) < close)
         )
-        for r in range(len(origins))
-    ]
-    return SegmentRadiance(*(np.array(column) for column in zip(*passed, strict=True)))
-
-
-def _composite_segment(
-    start: np.ndarray,
-    along: np.ndarray,
-    far: float,
-    opacities: np.ndarray,
-    colors: np.ndarray,
-    cutoffs: tuple[float, float, float, float],
-) -> tuple[np.ndarray, float, int, bool]:
-    """start, along: origin from the means, and direction, in coordinates of unit Gaussians."""
-    alpha_max, alpha_cut, stop, close = cutoffs
-    t = -np.sum(start * along, axis=1) / np.sum(along * along, axis=1)
-    squared = np.sum(np.square(start + t[:, None] * along), axis=1)
-    alpha = np.minimum(opacities * np.exp(-squared / 2), alpha_max)
-    seen = (alpha >= alpha_cut) & (t > 0) & (t < far)
-    near_ends = (np.abs(t) < close) | (np.abs(t - far) < close)
-    is_close = bool(
-        np.any((np.abs(alpha / alpha_cut - 1) < close) & (t > -close) & (t < far + close))
-        or np.any(near_ends & (alpha > alpha_cut * (1 - close)))
-    )
-    chosen = np.flatnonzero(seen)
-    chosen = chosen[np.argsort(t[chosen], kind="stable")]
-    is_close |= bool(np.any(np.diff(t[chosen]) < close))
-    color, transmittance, count = np.zeros(3), 1.0, 0
-    for i in chosen:
-        after = transmittance * (1 - alpha[i])
-        is_close |= abs(after / max(stop, 1e-300) - 1) < close
-        if after < stop:
-            break
-        color += transmittance * alpha[i] * colors[i]
-        transmittance, count = after, count + 1
-    return color, transmittance, count, is_close
+        segments.append((color, before[count], count, is_close))
+    return SegmentRadiance(*map(np.array, zip(*segments, strict=True)))

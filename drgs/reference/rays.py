@@ -4,14 +4,14 @@ It imports nothing of this package but ``reference``, and is to be read after it
 ``ImageModel`` is ``reference.render``; every field of it replaces one approximation, so that a
 kernel which makes other choices has an independent float64 computation to agree with.
 
-Where ``reference`` walks over splats, this file walks over pairs of a pixel and a splat::
+Where ``reference`` walks over splats, this file works on matrices of P pixels by N splats::
 
     Gaussians, Camera
       -> _splats     the splats on the film, and along its rays      (N splats)
       -> _boxes      the pixels that each may reach                  (N boxes)
-      -> _blocks     parts of the film with a bounded number of pairs
-      -> _pairs      response, sort key and depth, in compositing order    (pairs)
-      -> _composite  weights, transmittance                          (pairs, pixels)
+      -> _blocks     parts of the film with the splats that reach into them
+      -> _peaks      response, sort key and depth                    (P, N)
+      -> _composite  weights, transmittance                          (P, N) and (P,)
 
 Notation, with m the mean, S the covariance, both in camera axes, (fx, fy) the focal lengths in
 px, u0 = (m_x / m_z, m_y / m_z) the mean's slope:
@@ -39,9 +39,9 @@ Sources are those of ``reference``, and:
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import inf, isfinite
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 import pydantic
@@ -51,14 +51,11 @@ from pydantic import Field
 from drgs.reference import splatting as reference
 from drgs.reference.splatting import Camera, Gaussians, RenderedImage
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
+Rows = TypeVar("Rows")  # a dataclass of arrays (N, ...)
 
-D = TypeVar("D", bound="DataclassInstance")
-
-
-MAX_PAIRS = 2**18
-"""Pairs evaluated at a time: some 100 numbers each, so 200 MB, whatever the film and the scene."""
+MAX_PAIRS = 2**15
+"""Pairs of a pixel and a splat that are evaluated at a time: some 100 numbers each, so 25 MB,
+whatever the film and the scene; with more, fewer of them reach each other."""
 
 MIN_RELATIVE_STD = 1e-30
 """Least standard deviation of an exact splat, relative to its largest (without a low-pass) or to
@@ -72,9 +69,7 @@ OPEN_CONE = 1e-6
 """An ellipsoid this close (squared, relative) to the plane z = 0 is given the whole film."""
 
 
-# ----------------------------------------------------------------------------------------------
-# Types
-# ----------------------------------------------------------------------------------------------
+# ---- Types -----------------------------------------------------------------------------------
 
 
 @pydantic.dataclasses.dataclass(frozen=True)
@@ -101,9 +96,7 @@ class ImageModel:
     order: Literal["center", "pixel", "entry"] = "center"
     sh_direction: Literal["mean", "pixel"] = "mean"
     stop: Literal["before", "after"] = "before"
-    alpha_max: float = Field(
-        default=reference.ALPHA_MAX, gt=0, le=1
-    )  # upper clamp of alpha; 1: none
+    alpha_max: float = Field(default=reference.ALPHA_MAX, gt=0, le=1)  # upper clamp; 1: none
     alpha_cut: float = Field(default=reference.ALPHA_CUT, ge=0, lt=1)  # smaller: does not exist
     transmittance_stop: float = Field(default=reference.TRANSMITTANCE_STOP, ge=0, lt=1)  # 0: none
     extent: float = Field(default=inf, gt=0)  # standard deviations of a splat
@@ -141,39 +134,15 @@ class _Splats:
 
 @dataclass(frozen=True)
 class _Peaks:
-    """The peaks of M splats along the rays of M pixels."""
+    """The peaks of N splats along the rays of P pixels, (P, N)."""
 
-    rho_sq: np.ndarray  # (M,) squared distance from the mean, standard deviations
-    depths: np.ndarray  # (M,) t, camera z of the peak, world units
-    keys: np.ndarray  # (M,) what compositing sorts by, world units
-    ahead: np.ndarray  # (M,) relative to m_z: the splat does not exist where this is <= 0
-
-
-@dataclass(frozen=True)
-class _Block:
-    """A rectangle of the image and the parts of the splats' boxes within it."""
-
-    rows: slice
-    columns: slice
-    splats: np.ndarray  # (B,) indices of the splats that reach into it, ascending
-    boxes: np.ndarray  # (B, 2, 2) [first, end) columns and rows of the image
+    rho_sq: np.ndarray  # squared distance from the mean, standard deviations
+    depths: np.ndarray  # t, camera z of the peak, world units
+    keys: np.ndarray  # what compositing sorts by, world units
+    ahead: np.ndarray  # relative to m_z: the splat does not exist where this is <= 0
 
 
-@dataclass(frozen=True)
-class _Pairs:
-    """M pairs of a block, by pixel, then front to back."""
-
-    pixels: np.ndarray  # (M,) row-major within the block
-    splats: np.ndarray  # (M,)
-    alphas: np.ndarray  # (M,) clamped; 0 where the splat does not exist
-    keys: np.ndarray  # (M,) world units
-    depths: np.ndarray  # (M,) world units, what the image's depth sums
-    undecided: np.ndarray  # (M,) bool: a decision about this splat may flip in float32
-
-
-# ----------------------------------------------------------------------------------------------
-# The image
-# ----------------------------------------------------------------------------------------------
+# ---- The image -------------------------------------------------------------------------------
 
 
 def render(
@@ -196,7 +165,8 @@ def render(
 
     ``RenderedImage.depth`` sums the means' camera z for order ``"center"``, else that of the peaks.
     """
-    positions = pixel_centers(camera) if positions is None else np.asarray(positions, np.float64)
+    if positions is None:
+        positions = reference.pixel_centers(camera.width, camera.height)
     positions = positions if region is None else positions[region]
     background = np.asarray(background, dtype=np.float64)
     splats = _splats(gaussians, camera, model)
@@ -205,51 +175,35 @@ def render(
     shape = positions.shape[:2]
     image, depth = np.zeros((*shape, 3)), np.zeros(shape)
     transmittance, near_threshold = np.ones(shape), np.zeros(shape, dtype=bool)
-    whole = _Block(slice(0, shape[0]), slice(0, shape[1]), np.arange(len(boxes)), boxes)
-    for block in _blocks(whole):
-        place = block.rows, block.columns
-        points = positions[place].reshape(-1, 2)
-        pairs = _pairs(block, splats, points, model, threshold_width)
+    whole = slice(0, shape[0]), slice(0, shape[1])
+    for place, near in _blocks(*whole, boxes, np.arange(len(boxes))):
+        points, local = positions[place].reshape(-1, 2), _rows(splats, near)
         slopes = (points - camera.principal) / camera.focal
-        steps = model.step / np.sqrt(1 + np.sum(slopes**2, axis=1))  # in camera z
-        weights, behind, near = _composite(pairs, steps, model, threshold_width)
-
-        seen = weights > 0
-        colors = _pair_colors(splats, pairs, seen, camera, points, model)
-        sums = np.zeros((len(points), 4))
-        values = np.column_stack([colors, pairs.depths[seen]]) * weights[seen, None]
-        for channel in range(4):
-            sums[:, channel] = np.bincount(pairs.pixels[seen], values[:, channel], len(points))
+        rays = np.column_stack([slopes, np.ones(len(slopes))])
+        steps = model.step / np.linalg.norm(rays, axis=1)  # in camera z
+        peaks = _peaks(local, points, model)
+        weights, behind, marks = _composite(local, peaks, steps, model, threshold_width)
+        if model.sh_direction == "mean":
+            colors = weights @ local.colors
+        else:
+            colors = _colors_along(local, rays @ camera.rotation, weights)
         block_shape = transmittance[place].shape
-        image[place] = (sums[:, :3] + behind[:, None] * background).reshape(*block_shape, 3)
-        depth[place] = sums[:, 3].reshape(block_shape)
+        image[place] = (colors + behind[:, None] * background).reshape(*block_shape, 3)
+        depth[place] = np.sum(weights * peaks.depths, axis=1).reshape(block_shape)
         transmittance[place] = behind.reshape(block_shape)
-        near_threshold[place] = near.reshape(block_shape)
+        near_threshold[place] = marks.reshape(block_shape)
     return RenderedImage(image, 1 - transmittance, depth, transmittance, near_threshold)
 
 
-def _pair_colors(
-    splats: _Splats,
-    pairs: _Pairs,
-    seen: np.ndarray,
-    camera: Camera,
-    points: np.ndarray,
-    model: ImageModel,
-) -> np.ndarray:
-    """Return the colours (M', 3) of the pairs that are ``seen`` (M,), display space, >= 0."""
-    if model.sh_direction == "mean":
-        return splats.colors[pairs.splats[seen]]
-    slopes = (points - camera.principal) / camera.focal
-    rays = np.column_stack([slopes, np.ones(len(slopes))]) @ camera.rotation
+def _colors_along(splats: _Splats, rays: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return (P, 3), display space: sums of weights (P, N) times colours along rays (P, 3)."""
     directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    degree = round(splats.sh.shape[1] ** 0.5) - 1
-    basis = reference.sh_basis(directions, degree)[pairs.pixels[seen]]
-    return np.maximum(np.einsum("mk,mkc->mc", basis, splats.sh[pairs.splats[seen]]) + 0.5, 0.0)
+    basis = reference.sh_basis(directions, round(splats.sh.shape[1] ** 0.5) - 1)
+    colors = np.maximum(np.einsum("pk,nkc->pnc", basis, splats.sh) + 0.5, 0.0)
+    return np.einsum("pn,pnc->pc", weights, colors)
 
 
-# ----------------------------------------------------------------------------------------------
-# Splats
-# ----------------------------------------------------------------------------------------------
+# ---- Splats ----------------------------------------------------------------------------------
 
 
 def _splats(gaussians: Gaussians, camera: Camera, model: ImageModel) -> _Splats:
@@ -290,7 +244,7 @@ def _splats(gaussians: Gaussians, camera: Camera, model: ImageModel) -> _Splats:
         depth_var=np.sum((affine.axes[:, 2] / z[:, None]) ** 2, axis=-1),
         whitened=whitened,
         colors=reference.sh_colors(gaussians, camera, degree),
-        sh=reference._sh_coefficients(gaussians, degree),
+        sh=gaussians.sh[:, : (degree + 1) ** 2],
     )
     return _rows(splats, (opacities > model.alpha_cut) & (extended | (model.low_pass > 0)))
 
@@ -373,110 +327,64 @@ def _inverse_factors(rows: np.ndarray, smallest: np.ndarray) -> np.ndarray:
     return inverse
 
 
-# ----------------------------------------------------------------------------------------------
-# A splat at a pixel
-# ----------------------------------------------------------------------------------------------
+# ---- A splat at a pixel ----------------------------------------------------------------------
 
 
-def _peaks(splats: _Splats, i: np.ndarray, offsets: np.ndarray, model: ImageModel) -> _Peaks:
-    """Return the peaks of the splats i (M,) at pixels that are ``offsets`` (M, 2) px from them."""
-    if model.projection == "exact":
-        return _exact_peaks(splats, i, offsets, model)
-    return _affine_peaks(splats, i, offsets, model)
+def _peaks(splats: _Splats, points: np.ndarray, model: ImageModel) -> _Peaks:
+    """Return the peaks of N splats at pixels that are evaluated at points (P, 2), px, film."""
+    offsets = points[:, None] - splats.means2d
+    peaks = _exact_peaks if model.projection == "exact" else _affine_peaks
+    return _Peaks(*np.broadcast_arrays(*peaks(splats, offsets, model)))
 
 
-def _affine_peaks(splats: _Splats, i: np.ndarray, offsets: np.ndarray, model: ImageModel) -> _Peaks:
-    """Return the peaks of a Gaussian on the film: rho^2 = d^T C^-1 d, t = m_z a / D.
+def _affine_peaks(splats: _Splats, offsets: np.ndarray, model: ImageModel) -> tuple:
+    """Return the peaks of Gaussians on the film: rho^2 = d^T C^-1 d, t = m_z a / D.
 
     With C = L L^T, e = L^-1 d and kappa = L^-1 k: rho^2 = |e|^2, a = 1 - kappa . e,
     h = w - |kappa|^2, D = a^2 + h |e|^2. Order ``"center"`` does not ask for the depth, and a
     splat then exists whatever the sign of a.
     """
-    z = splats.depths[i]
-    e = _whitened_on_film(splats, i, offsets)
+    z = splats.depths
+    e = _whitened_on_film(splats, offsets)
     rho_sq = np.sum(e**2, axis=-1)
     if model.order == "center":
-        return _Peaks(rho_sq, z, z, np.ones_like(z))
-    kappa = _whitened_on_film(splats, i, splats.depth_cov[i])
+        return rho_sq, z, z, 1.0
+    kappa = _whitened_on_film(splats, splats.depth_cov)
     a = 1 - np.sum(kappa * e, axis=-1)
-    h = np.maximum(splats.depth_var[i] - np.sum(kappa**2, axis=-1), 0.0)
+    h = np.maximum(splats.depth_var - np.sum(kappa**2, axis=-1), 0.0)
     t = z * a / np.where(a > 0, a**2 + h * rho_sq, 1.0)
-    return _Peaks(rho_sq, depths=t, keys=t, ahead=a)
+    return rho_sq, t, t, a
 
 
-def _whitened_on_film(splats: _Splats, i: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return L^-1 v (M, 2) for vectors v (M, 2) px, C = L L^T of the splats i, L triangular."""
-    variance, covariance = splats.cov2d[i, 0, 0], splats.cov2d[i, 0, 1]
-    first = vectors[:, 0] / np.sqrt(variance)
-    rest = vectors[:, 1] - covariance / variance * vectors[:, 0]
-    return np.stack([first, rest / np.sqrt(splats.dets[i] / variance)], axis=-1)
+def _whitened_on_film(splats: _Splats, vectors: np.ndarray) -> np.ndarray:
+    """Return L^-1 v (..., N, 2) for vectors v (..., N, 2) px, C = L L^T, L triangular."""
+    variance, covariance = splats.cov2d[:, 0, 0], splats.cov2d[:, 0, 1]
+    first = vectors[..., 0] / np.sqrt(variance)
+    rest = vectors[..., 1] - covariance / variance * vectors[..., 0]
+    return np.stack([first, rest / np.sqrt(splats.dets / variance)], axis=-1)
 
 
-def _exact_peaks(splats: _Splats, i: np.ndarray, offsets: np.ndarray, model: ImageModel) -> _Peaks:
-    """Return the peaks of a Gaussian along rays r, at t = Br . Bm / |Br|^2.
+def _exact_peaks(splats: _Splats, offsets: np.ndarray, model: ImageModel) -> tuple:
+    """Return the peaks of Gaussians along rays r, at t = Br . Bm / |Br|^2.
 
     rho^2 = |Bm x Br|^2 / |Br|^2, where Bm x Br = Bm x B (r - m / m_z) does not cancel near the
     mean. The ray enters the ellipsoid rho = extent at sqrt(extent^2 - rho^2) / |Br| before t.
     """
-    z, (x_axis, y_axis, to_mean) = splats.depths[i], np.moveaxis(splats.whitened[i], 2, 0)
-    sideways = x_axis * offsets[:, :1] + y_axis * offsets[:, 1:]
+    z, (x_axis, y_axis, to_mean) = splats.depths, np.moveaxis(splats.whitened, 2, 0)
+    sideways = x_axis * offsets[..., :1] + y_axis * offsets[..., 1:]
     ray = to_mean + sideways
     ray_sq = np.sum(ray**2, axis=-1)
     rho_sq = z**2 * np.sum(np.cross(to_mean, sideways) ** 2, axis=-1) / ray_sq
     t = z * np.sum(ray * to_mean, axis=-1) / ray_sq
     if model.order == "center":
-        return _Peaks(rho_sq, depths=z, keys=z, ahead=t / z)
+        return rho_sq, z, z, t / z
     if model.order == "pixel":
-        return _Peaks(rho_sq, depths=t, keys=t, ahead=t / z)
+        return rho_sq, t, t, t / z
     entry = t - np.sqrt(np.maximum(model.extent**2 - rho_sq, 0.0) / ray_sq)
-    return _Peaks(rho_sq, depths=t, keys=entry, ahead=entry / z)
+    return rho_sq, t, entry, entry / z
 
 
-def _pairs(
-    block: _Block, splats: _Splats, points: np.ndarray, model: ImageModel, threshold_width: float
-) -> _Pairs:
-    """Return the pairs of a block whose splat exists at its pixel, or may in single precision.
-
-    points: (P, 2) px, film, where the block's pixels are evaluated, row by row.
-    """
-    i, pixels = _pairs_in_boxes(block)
-    peaks = _peaks(splats, i, points[pixels] - splats.means2d[i], model)
-    raw = splats.opacities[i] * np.exp(-0.5 * peaks.rho_sq)
-    far = model.extent**2
-    possible = (
-        (raw >= model.alpha_cut * (1 - threshold_width))
-        & (peaks.rho_sq <= far * (1 + threshold_width))
-        & (peaks.ahead > -threshold_width)
-    )
-    exists = (raw >= model.alpha_cut) & (peaks.rho_sq <= far) & (peaks.ahead > 0)
-    undecided = (
-        _is_near(raw, model.alpha_cut, threshold_width)
-        | _is_near(raw, model.alpha_max, threshold_width)
-        | _is_near(peaks.rho_sq, far, threshold_width)
-        | (np.abs(peaks.ahead) <= threshold_width)
-    )
-    order = np.lexsort((i[possible], peaks.keys[possible], pixels[possible]))
-    chosen = np.flatnonzero(possible)[order]
-    return _Pairs(
-        pixels=pixels[chosen],
-        splats=i[chosen],
-        alphas=np.where(exists, np.minimum(raw, model.alpha_max), 0.0)[chosen],
-        keys=peaks.keys[chosen],
-        depths=peaks.depths[chosen],
-        undecided=undecided[chosen],
-    )
-
-
-def _is_near(values: np.ndarray, threshold: float, width: float) -> np.ndarray:
-    """Return (M,) bool: within ``width``, relative; nothing is near a threshold of 0 or inf."""
-    if threshold == 0 or not isfinite(threshold):
-        return np.zeros(np.shape(values), dtype=bool)
-    return np.abs(values - threshold) <= width * threshold
-
-
-# ----------------------------------------------------------------------------------------------
-# Which pixels a splat may reach
-# ----------------------------------------------------------------------------------------------
+# ---- Which pixels a splat may reach ----------------------------------------------------------
 
 
 def _boxes(
@@ -536,96 +444,86 @@ def _film_bounds(
     )
 
 
-def _blocks(block: _Block) -> Iterator[_Block]:
-    """Yield parts of a block, halved until each has at most ``MAX_PAIRS`` pairs or one pixel."""
-    limits = np.array(
-        [[block.columns.start, block.columns.stop], [block.rows.start, block.rows.stop]]
-    )
-    boxes = np.clip(block.boxes, limits[:, :1], limits[:, 1:])
-    counts = np.prod(boxes[:, :, 1] - boxes[:, :, 0], axis=-1)
-    touching = counts > 0
-    clipped = _Block(block.rows, block.columns, block.splats[touching], boxes[touching])
-    width, height = limits[:, 1] - limits[:, 0]
-    if counts.sum() <= MAX_PAIRS or width * height == 1:
-        yield clipped
-        return
-    for rows, columns in _halves(block.rows, block.columns):
-        yield from _blocks(_Block(rows, columns, clipped.splats, clipped.boxes))
+def _blocks(
+    rows: slice, columns: slice, boxes: np.ndarray, near: np.ndarray
+) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
+    """Yield parts of a rectangle, and the indices of the splats whose boxes reach into each.
 
-
-def _halves(rows: slice, columns: slice) -> list[tuple[slice, slice]]:
-    """Return the two halves of a rectangle, cut across its longer side."""
-    if rows.stop - rows.start > columns.stop - columns.start:
+    It is halved across its longer side until it has at most ``MAX_PAIRS`` pairs or one pixel. near:
+    the indices among which those of the rectangle are.
+    """
+    start, stop = np.array([columns.start, rows.start]), np.array([columns.stop, rows.stop])
+    reaches = (boxes[near, :, 0] < stop) & (boxes[near, :, 1] > start)
+    near = near[reaches.all(axis=1)]
+    width, height = stop - start
+    if len(near) * width * height <= MAX_PAIRS or width * height == 1:
+        yield (rows, columns), near
+    elif height > width:
         middle = (rows.start + rows.stop) // 2
-        return [(slice(rows.start, middle), columns), (slice(middle, rows.stop), columns)]
-    middle = (columns.start + columns.stop) // 2
-    return [(rows, slice(columns.start, middle)), (rows, slice(middle, columns.stop))]
+        yield from _blocks(slice(rows.start, middle), columns, boxes, near)
+        yield from _blocks(slice(middle, rows.stop), columns, boxes, near)
+    else:
+        middle = (columns.start + columns.stop) // 2
+        yield from _blocks(rows, slice(columns.start, middle), boxes, near)
+        yield from _blocks(rows, slice(middle, columns.stop), boxes, near)
 
 
-def _pairs_in_boxes(block: _Block) -> tuple[np.ndarray, np.ndarray]:
-    """Return the splat (M,) and the pixel (M,), row-major within the block, of all its pairs."""
-    widths, heights = (block.boxes[:, :, 1] - block.boxes[:, :, 0]).T
-    counts = widths * heights
-    owner = np.repeat(np.arange(len(counts)), counts)
-    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    columns = block.boxes[owner, 0, 0] + within % widths[owner] - block.columns.start
-    rows = block.boxes[owner, 1, 0] + within // widths[owner] - block.rows.start
-    return block.splats[owner], rows * (block.columns.stop - block.columns.start) + columns
-
-
-# ----------------------------------------------------------------------------------------------
-# Compositing
-# ----------------------------------------------------------------------------------------------
+# ---- Compositing -----------------------------------------------------------------------------
 
 
 def _composite(
-    pairs: _Pairs, steps: np.ndarray, model: ImageModel, threshold_width: float
+    splats: _Splats, peaks: _Peaks, steps: np.ndarray, model: ImageModel, threshold_width: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the weights T alpha (M,), the transmittance (P,) and the marks (P,) of P pixels.
+    """Return the weights T alpha (P, N), the transmittance (P,) and the marks (P,) of P pixels.
 
     steps: (P,) the model's step in the units of the keys.
 
-    Pixels are taken together whose lists have a length in (2^(n-1), 2^n]: as rows of a matrix,
-    filled up with alpha = 0, which at most doubles them. Transmittance is a cumulative product,
-    and as it never rises, the pixel is finished exactly where it is below the stop.
+    Transmittance is a cumulative product, and as it never rises, a pixel is finished exactly where
+    it is below the stop. Pairs that do not exist, even in single precision, come last.
     """
-    num_pixels = len(steps)
-    weights, transmittance = np.zeros(len(pairs.pixels)), np.ones(num_pixels)
-    near_threshold = np.zeros(num_pixels, dtype=bool)
-    lengths = np.bincount(pairs.pixels, minlength=num_pixels)
-    ranks = np.arange(len(pairs.pixels)) - (np.cumsum(lengths) - lengths)[pairs.pixels]
-    sizes = np.where(lengths > 0, np.ceil(np.log2(np.maximum(lengths, 1))), -1).astype(int)
-    for size in np.unique(sizes[lengths > 0]):
-        members = np.flatnonzero(sizes == size)
-        chosen = np.flatnonzero(sizes[pairs.pixels] == size)
-        cells = np.searchsorted(members, pairs.pixels[chosen]), ranks[chosen]
+    raw, far = splats.opacities * np.exp(-0.5 * peaks.rho_sq), model.extent**2
+    exists = (raw >= model.alpha_cut) & (peaks.rho_sq <= far) & (peaks.ahead > 0)
+    possible = (
+        (raw >= model.alpha_cut * (1 - threshold_width))
+        & (peaks.rho_sq <= far * (1 + threshold_width))
+        & (peaks.ahead > -threshold_width)
+    )
+    undecided = possible & (
+        _is_near(raw, model.alpha_cut, threshold_width)
+        | _is_near(raw, model.alpha_max, threshold_width)
+        | _is_near(peaks.rho_sq, far, threshold_width)
+        | (np.abs(peaks.ahead) <= threshold_width)
+    )
+    keys = np.where(possible, peaks.keys, inf)
+    alphas = np.where(exists, np.minimum(raw, model.alpha_max), 0.0)
+    order = np.argsort(keys, axis=1, kind="stable")
+    keys, alphas, near = (np.take_along_axis(m, order, axis=1) for m in (keys, alphas, undecided))
 
-        shape = len(members), 2**size
+    if model.step > 0:
+        alphas = np.where(_passed_over(alphas > 0, keys, steps), 0.0, alphas)
+    behind = np.cumprod(1 - alphas, axis=1)
+    before = np.column_stack([np.ones(len(behind)), behind])[:, :-1]
+    unfinished = before >= model.transmittance_stop
+    composited = unfinished if model.stop == "after" else behind >= model.transmittance_stop
+    weights = np.zeros_like(alphas)
+    np.put_along_axis(weights, order, np.where(composited, before * alphas, 0.0), axis=1)
+    transmittance = np.min(np.where(composited, behind, 1.0), axis=1, initial=1.0)
 
-        alphas = _matrix(pairs.alphas[chosen], cells, shape)
-        if model.step > 0:
-            keys = _matrix(pairs.keys[chosen], cells, shape)
-            alphas = np.where(_passed_over(alphas > 0, keys, steps[members]), 0.0, alphas)
-        behind = np.cumprod(1 - alphas, axis=1)
-        before = np.column_stack([np.ones(len(members)), behind[:, :-1]])
-        unfinished = before >= model.transmittance_stop
-        composited = unfinished if model.stop == "after" else behind >= model.transmittance_stop
-        weights[chosen] = np.where(composited, before * alphas, 0.0)[cells]
-        transmittance[members] = np.min(np.where(composited, behind, 1.0), axis=1)
+    near |= (alphas > 0) & _is_near(behind, model.transmittance_stop, threshold_width)
+    if model.order != "center":
+        near |= (alphas > 0) & _follows_closely(keys, threshold_width)
+    return weights, transmittance, np.any(unfinished & near, axis=1)
 
-        exists = alphas > 0
-        near = _matrix(pairs.undecided[chosen], cells, shape) | (
-            exists & _is_near(behind, model.transmittance_stop, threshold_width)
-        )
-        if model.order != "center":
-            keys = _matrix(pairs.keys[chosen], cells, shape)
-            near |= exists & _follows_closely(keys, threshold_width)
-        near_threshold[members] = np.any(unfinished & near, axis=1)
-    return weights, transmittance, near_threshold
+
+def _is_near(values: np.ndarray, threshold: float, width: float) -> np.ndarray:
+    """Return (P, N) bool: within ``width``, relative; nothing is near a threshold of 0 or inf."""
+    if threshold == 0 or not isfinite(threshold):
+        return np.zeros(np.shape(values), dtype=bool)
+    return np.abs(values - threshold) <= width * threshold
 
 
 def _passed_over(exists: np.ndarray, keys: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return (P, L) bool: the splat's key is within the step (P,) behind the last one entered."""
+    """Return (P, N) bool: the splat's key is within the step (P,) behind the last one entered."""
     passed, last = np.zeros_like(exists), np.full(len(keys), -inf)
     for rank in range(keys.shape[1]):
         passed[:, rank] = exists[:, rank] & (keys[:, rank] < last + steps)
@@ -633,33 +531,19 @@ def _passed_over(exists: np.ndarray, keys: np.ndarray, steps: np.ndarray) -> np.
     return passed
 
 
-def _matrix(values: np.ndarray, cells: tuple, shape: tuple[int, int]) -> np.ndarray:
-    """Return a matrix with the values (M,) in its cells, rows and columns (M,) each, else 0."""
-    matrix = np.zeros(shape, dtype=values.dtype)
-    matrix[cells] = values
-    return matrix
-
-
 def _follows_closely(keys: np.ndarray, width: float) -> np.ndarray:
-    """Return (P, L) bool: the sort key (P, L) is that of the splat before it, within ``width``.
+    """Return (P, N) bool: the sort key (P, N) is that of the splat before it, within ``width``.
 
     A splat that does not exist may stand between two that do: it is near a threshold itself.
     """
-    steps = np.diff(keys, axis=1, prepend=-inf)
+    with np.errstate(invalid="ignore"):  # of those that do not exist
+        steps = np.diff(keys, axis=1, prepend=-inf)
     return steps <= width * np.abs(keys)
 
 
-# ----------------------------------------------------------------------------------------------
-# Small helpers
-# ----------------------------------------------------------------------------------------------
+# ---- Small helpers ---------------------------------------------------------------------------
 
 
-def _rows(data: D, chosen: np.ndarray) -> D:
-    """Return a dataclass of arrays (N, ...) with the rows that are ``chosen`` (N,) bool."""
-    return type(data)(**{field.name: getattr(data, field.name)[chosen] for field in fields(data)})
-
-
-def pixel_centers(camera: Camera) -> np.ndarray:
-    """Return the centres (height, width, 2), px, (x, y), of the film's pixels."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    return np.stack([x, y], axis=-1)
+def _rows(data: Rows, chosen: np.ndarray) -> Rows:
+    """Return some rows; chosen: indices, or a mask (N,)."""
+    return type(data)(**{name: array[chosen] for name, array in vars(data).items()})

@@ -56,9 +56,7 @@ THRESHOLD_WIDTH = 1e-6
 """Relative distance from a threshold at which single precision may decide otherwise."""
 
 
-# ----------------------------------------------------------------------------------------------
-# Types
-# ----------------------------------------------------------------------------------------------
+# ---- Types -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -117,6 +115,11 @@ class Gaussians:
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
 
     @property
+    def sh(self) -> np.ndarray:
+        """All coefficients (N, K, 3)."""
+        return np.concatenate([self.sh0, self.shN], axis=1)
+
+    @property
     def sh_degree(self) -> int:
         """Highest degree stored, 0 to 3."""
         return {0: 0, 3: 1, 8: 2, 15: 3}[self.shN.shape[1]]
@@ -132,7 +135,12 @@ class Projection:
     depths: np.ndarray  # (N,) camera z, world units; the true one for culled rows too
     opacities: np.ndarray  # (N,) activated; after compensation, if requested
     visible: np.ndarray  # (N,) bool: depths >= near and opacities > ALPHA_CUT; may be off film
-    cuts: np.ndarray | float | None = None  # (N,) or for all: smallest alphas; None: ALPHA_CUT
+    cuts: np.ndarray | float = ALPHA_CUT  # (N,) or for all: smallest alphas at a pixel
+
+    @property
+    def all_cuts(self) -> np.ndarray:
+        """The cuts (N,)."""
+        return np.broadcast_to(self.cuts, self.depths.shape)
 
 
 @dataclass(frozen=True)
@@ -147,9 +155,7 @@ class RenderedImage:
     stops: np.ndarray | None = None  # (H, W) of ``composite``: rank in depth at which it stopped
 
 
-# ----------------------------------------------------------------------------------------------
-# Gaussians in the world
-# ----------------------------------------------------------------------------------------------
+# ---- Gaussians in the world ------------------------------------------------------------------
 
 
 def quat_to_rotation(quats: np.ndarray) -> np.ndarray:
@@ -183,9 +189,7 @@ def sigmoid(logits: np.ndarray) -> np.ndarray:
     return np.exp(-np.logaddexp(0.0, -logits))
 
 
-# ----------------------------------------------------------------------------------------------
-# Colour
-# ----------------------------------------------------------------------------------------------
+# ---- Colour ----------------------------------------------------------------------------------
 
 # Normalisation of the real spherical harmonics (Condon-Shortley phase, as in 3DGS), with l the
 # degree: C_LM multiplies the polynomials of order +-m.
@@ -256,11 +260,12 @@ def sh_basis_gradient(directions: np.ndarray, degree: int) -> np.ndarray:
     return _rows_of_matrices(gradient[: (degree + 1) ** 2])
 
 
-def sh_colors(gaussians: Gaussians, camera: Camera, degree: int) -> np.ndarray:
+def sh_colors(gaussians: Gaussians, camera: Camera, degree: int | None = None) -> np.ndarray:
     """Return the colours (N, 3) that the camera sees, display space, >= 0, not bounded above.
 
     color = max(0, sum_k Y_k(direction) coefficient_k + 0.5), with the direction from the camera's
-    centre to the mean (3DGS rasterizer). ``degree`` may be lower than what is stored.
+    centre to the mean (3DGS rasterizer). ``degree`` may be lower than what is stored, which is
+    the default.
     """
     directions, _ = _view_directions(gaussians, camera)
     return np.maximum(unclamped_colors(gaussians, directions, degree), 0.0)
@@ -271,24 +276,19 @@ def _view_directions(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, 
     return _normalize(gaussians.means - camera.center, fallback=(0.0, 0.0, 1.0))
 
 
-def unclamped_colors(gaussians: Gaussians, directions: np.ndarray, degree: int) -> np.ndarray:
+def unclamped_colors(
+    gaussians: Gaussians, directions: np.ndarray, degree: int | None = None
+) -> np.ndarray:
     """Return colours (N, 3) before they are clamped at zero.
 
     directions: unit, world, (N, 3) or, for all Gaussians, (1, 3).
     """
-    colors = sh_basis(directions, degree)[..., None] * _sh_coefficients(gaussians, degree)
+    degree = gaussians.sh_degree if degree is None else degree
+    colors = sh_basis(directions, degree)[..., None] * gaussians.sh[:, : (degree + 1) ** 2]
     return np.sum(colors, axis=1) + 0.5
 
 
-def _sh_coefficients(gaussians: Gaussians, degree: int) -> np.ndarray:
-    """Return (N, K, 3): the coefficients up to ``degree``."""
-    coefficients = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)
-    return coefficients[:, : (degree + 1) ** 2]
-
-
-# ----------------------------------------------------------------------------------------------
-# Projection
-# ----------------------------------------------------------------------------------------------
+# ---- Projection ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -401,63 +401,48 @@ def _inverses(matrices: np.ndarray, dets: np.ndarray) -> np.ndarray:
     return _rows_of_matrices([[c / dets, -b / dets], [-b / dets, a / dets]])
 
 
-# ----------------------------------------------------------------------------------------------
-# Compositing
-# ----------------------------------------------------------------------------------------------
+# ---- Compositing -----------------------------------------------------------------------------
+
+
+def pixel_centers(width: int, height: int) -> np.ndarray:
+    """Return the centres (height, width, 2), px, (x, y), of the film's pixels."""
+    y, x = np.mgrid[:height, :width] + 0.5
+    return np.stack([x, y], axis=-1)
 
 
 @dataclass(frozen=True)
 class _Footprint:
-    """A splat on the pixels of its bounding box of h x w pixels."""
+    """A splat on h x w pixels."""
 
-    box: tuple[slice, slice]  # rows and columns of the film
-    dx: np.ndarray  # (1, w) px, from the splat's mean to the pixel centres
-    dy: np.ndarray  # (h, 1) px
+    offsets: np.ndarray  # (h, w, 2) d, px, from the splat's mean to the pixel centres
     falloff: np.ndarray  # (h, w) exp(-d^T A d / 2)
     raw_alpha: np.ndarray  # (h, w) opacity * falloff, before the clamp
 
 
 def _footprint(
-    box: tuple[slice, slice],
-    mean2d: np.ndarray,
-    conic: np.ndarray,
-    opacity: float | np.ndarray,
-    period: float | None = None,
+    splats: Projection, i: int, centers: np.ndarray, period: float | None = None
 ) -> _Footprint:
-    """Evaluate G(d) = exp(-d^T A d / 2) (3DGS, equation 4, on the film) in a box of pixels."""
-    rows, columns = box
-    dx = (np.arange(columns.start, columns.stop) + 0.5 - mean2d[0])[None, :]
+    """Evaluate G(d) = exp(-d^T A d / 2) (3DGS, equation 4, on the film) at centers (h, w, 2)."""
+    offsets = centers - splats.means2d[i]
     if period is not None:
-        dx = dx - period * np.round(dx / period)
-    dy = (np.arange(rows.start, rows.stop) + 0.5 - mean2d[1])[:, None]
-    a, b, c = conic[0, 0], conic[0, 1], conic[1, 1]
-    falloff = np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
-    return _Footprint(box, dx, dy, falloff, opacity * falloff)
+        offsets[..., 0] -= period * np.round(offsets[..., 0] / period)
+    falloff = np.exp(-0.5 * np.einsum("hwi,hwi->hw", offsets @ splats.conics[i], offsets))
+    return _Footprint(offsets, falloff, splats.opacities[i] * falloff)
 
 
 def _pixel_boxes(
-    means2d: np.ndarray,
-    conics: np.ndarray,
-    opacities: np.ndarray,
-    smallest_alpha: np.ndarray | float,
-    width: int,
-    height: int,
+    splats: Projection, order: np.ndarray, width: int, height: int, threshold_width: float = 0.0
 ) -> list[tuple[slice, slice]]:
-    """Return, for each splat, the rows and columns outside which its alpha is < smallest_alpha.
+    """Return the rows and columns outside which each splat of ``order`` is below its cut.
 
-    opacity exp(-d^T A d / 2) >= smallest_alpha is the ellipse d^T A d <= k with
-    k = 2 ln(opacity / smallest_alpha); with A = cov2d^-1 its half width is sqrt(k cov2d_xx) and
-    its half height sqrt(k cov2d_yy). One pixel is added for rounding. Where inverting A would
-    cancel, the box is the whole film.
+    opacity exp(-d^T A d / 2) >= cut is the ellipse d^T A d <= k with k = 2 ln(opacity / cut), where
+    a cut is lower by ``threshold_width``; with A = cov2d^-1 its half width is sqrt(k cov2d_xx) and
+    its half height sqrt(k cov2d_yy). One pixel is added for rounding.
     """
-    a, b, c = conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]
-    dets = a * c - b * b
-    well_conditioned = dets > 1e-9 * np.abs(a * c)
-    dets = np.where(well_conditioned, dets, 1.0)
-    k = 2 * np.log(np.maximum(opacities, smallest_alpha) / smallest_alpha)
-    variances = np.stack([c, a], axis=-1) / dets[:, None]
-    half_sizes = np.sqrt(np.maximum(k[:, None] * variances, 0.0)) + 1.0
-    half_sizes[~well_conditioned] = np.inf
+    means2d, cuts = splats.means2d[order], splats.all_cuts[order] * (1 - threshold_width)
+    k = 2 * np.log(np.maximum(splats.opacities[order], cuts) / cuts)
+    variances = np.diagonal(splats.cov2d[order], axis1=1, axis2=2)
+    half_sizes = np.sqrt(k[:, None] * variances) + 1.0
     # fmin and fmax also send a NaN to the film's border, so that the conversion is defined.
     film = np.array([width, height], dtype=np.float64)
     first = np.fmin(np.fmax(np.ceil(means2d - half_sizes - 0.5), 0.0), film).astype(int)
@@ -475,43 +460,32 @@ def depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
 
 
 def composite(
-    means2d: np.ndarray,
-    conics: np.ndarray,
-    opacities: np.ndarray,
+    splats: Projection,
     colors: np.ndarray,
-    depths: np.ndarray,
-    visible: np.ndarray,
     background: ArrayLike,
     width: int,
     height: int,
     threshold_width: float = THRESHOLD_WIDTH,
-    cuts: np.ndarray | float | None = None,
     period: float | None = None,
 ) -> RenderedImage:
     """Return the image of N splats: C = sum_i T_i alpha_i c_i + T background (3DGS, equation 3).
 
     T_i = prod_{j < i} (1 - alpha_j), alpha_i = min(0.99, o_i exp(-d^T A_i d / 2)), over the
-    splats i in ascending depth (ties by index) whose alpha is at least ``cuts``, (N,) or for all;
-    None: 1/255. A pixel is finished before the first splat that would take T below 1e-4: that splat
-    is not composited.
+    visible splats i in ascending depth (ties by index) whose alpha is at least their cut. A pixel
+    is finished before the first splat that would take T below 1e-4: that splat is not composited.
 
-    means2d (N, 2) px; conics (N, 2, 2) px^-2, symmetric; opacities (N,); colors (N, 3) display
-    space; depths (N,) camera z; visible (N,) bool: the others are left out; background (3,)
-    display space; width and height of the film, px; threshold_width: relative distance from a
-    threshold within which ``RenderedImage.near_threshold`` marks a pixel. Marked are pixels at
-    which an alpha, evaluated before the pixel is finished, is that close to the cut or (before
-    clamping) to the clamp, or the transmittance behind a splat is that close to the stop.
+    colors (N, 3) and background (3,) display space; width and height of the film, px;
+    threshold_width: relative distance from a threshold within which
+    ``RenderedImage.near_threshold`` marks a pixel. Marked are pixels at which an alpha, evaluated
+    before the pixel is finished, is that close to the cut or (before clamping) to the clamp, or the
+    transmittance behind a splat is that close to the stop.
 
     period: px along x after which a splat is seen again, of which a pixel has the nearest; None:
     never.
     """
-    means2d, conics, opacities, colors, depths, background = _as_float64(
-        means2d, conics, opacities, colors, depths, background
-    )
-    order = depth_order(depths, visible)
-    cuts = np.broadcast_to(ALPHA_CUT if cuts is None else cuts, depths.shape)
-    smallest = cuts[order] * (1 - threshold_width)
-    boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], smallest, width, height)
+    order = depth_order(splats.depths, splats.visible)
+    centers, cuts = pixel_centers(width, height), splats.all_cuts
+    boxes = _pixel_boxes(splats, order, width, height, threshold_width)
     if period is not None:
         boxes = [(rows, slice(0, width)) for rows, _ in boxes]
     never = len(order)
@@ -525,7 +499,7 @@ def composite(
     stops = np.full((height, width), never)
     near_threshold = np.zeros((height, width), dtype=bool)
     for rank, (i, box) in enumerate(zip(order, boxes, strict=True)):
-        splat = _footprint(box, means2d[i], conics[i], opacities[i], period)
+        splat = _footprint(splats, i, centers[box], period)
         alpha = np.minimum(splat.raw_alpha, ALPHA_MAX)
         unfinished = stops[box] == never
         contributes = unfinished & (alpha >= cuts[i])
@@ -541,10 +515,10 @@ def composite(
         contributes &= ~stopping
         weight = np.where(contributes, transmittance[box] * alpha, 0.0)
         image[box] += weight[..., None] * colors[i]
-        depth[box] += weight * depths[i]
+        depth[box] += weight * splats.depths[i]
         transmittance[box] = np.where(contributes, behind, transmittance[box])
 
-    image += transmittance[..., None] * background
+    image += transmittance[..., None] * np.asarray(background)
     return RenderedImage(image, 1 - transmittance, depth, transmittance, near_threshold, stops)
 
 
@@ -561,38 +535,26 @@ def render(
     background: (3,) display space; sh_degree: None for all that is stored; antialiased: see
     ``project``; threshold_width: see ``composite``.
     """
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
     splats = project(gaussians, camera, antialiased)
-    colors = sh_colors(gaussians, camera, degree)
-    return composite(
-        splats.means2d, splats.conics, splats.opacities, colors, splats.depths, splats.visible,
-        background, camera.width, camera.height, threshold_width, splats.cuts,
-    )  # fmt: skip
+    colors = sh_colors(gaussians, camera, sh_degree)
+    return composite(splats, colors, background, camera.width, camera.height, threshold_width)
 
 
-# ----------------------------------------------------------------------------------------------
-# Gradients, from the pixels back to the Gaussians
-# ----------------------------------------------------------------------------------------------
+# ---- Gradients, from the pixels back to the Gaussians ----------------------------------------
 
 
 def composite_gradients(
-    means2d: np.ndarray,
-    conics: np.ndarray,
-    opacities: np.ndarray,
+    splats: Projection,
     colors: np.ndarray,
-    depths: np.ndarray,
-    visible: np.ndarray,
     background: ArrayLike,
-    width: int,
-    height: int,
     d_image: np.ndarray,
-    d_alpha: np.ndarray | None = None,
-    d_depth: np.ndarray | None = None,
+    d_alpha: ArrayLike = 0.0,
+    d_depth: ArrayLike = 0.0,
 ) -> dict[str, np.ndarray]:
     """Return the gradients of L = sum d_image image + sum d_alpha alpha + sum d_depth depth.
 
-    The first nine arguments are ``composite``'s. d_image (H, W, 3); d_alpha and d_depth (H, W),
-    None for zero. The result has ``means2d`` (N, 2), ``conics`` (N, 2, 2), ``opacities`` (N,),
+    The first three arguments are ``composite``'s. d_image (H, W, 3); d_alpha and d_depth (H, W), or
+    a number for all. The result has ``means2d`` (N, 2), ``conics`` (N, 2, 2), ``opacities`` (N,),
     ``colors`` (N, 3), ``depths`` (N,) and ``background`` (3,), zero for splats that are left out.
 
     ``conics`` is the symmetric matrix G with dL = sum_ij G_ij dA_ij. In terms of the three
@@ -612,40 +574,33 @@ def composite_gradients(
     Not differentiated: the depth order and the decisions at the thresholds. Where alpha is
     clamped its derivative is zero.
     """
-    means2d, conics, opacities, colors, depths, background, d_image = _as_float64(
-        means2d, conics, opacities, colors, depths, background, d_image
-    )
-    zeros = np.zeros((height, width))
-    d_alpha, d_depth = _as_float64(
-        zeros if d_alpha is None else d_alpha, zeros if d_depth is None else d_depth
-    )
-    rendered = composite(
-        means2d, conics, opacities, colors, depths, visible, background, width, height
-    )
+    height, width, _ = d_image.shape
+    d_alpha, d_depth = (np.broadcast_to(each, (height, width)) for each in (d_alpha, d_depth))
+    rendered = composite(splats, colors, background, width, height)
     assert rendered.stops is not None, "composite sets it"
-    order = depth_order(depths, visible)
-    boxes = _pixel_boxes(means2d[order], conics[order], opacities[order], ALPHA_CUT, width, height)
+    order = depth_order(splats.depths, splats.visible)
+    centers, cuts = pixel_centers(width, height), splats.all_cuts
+    boxes = _pixel_boxes(splats, order, width, height)
 
-    n = len(means2d)
-    d_means2d = np.zeros((n, 2))
-    d_conics = np.zeros((n, 2, 2))
-    d_opacities = np.zeros(n)
-    d_colors = np.zeros((n, 3))
-    d_depths = np.zeros(n)
+    d_means2d = np.zeros_like(splats.means2d)
+    d_conics = np.zeros_like(splats.conics)
+    d_opacities = np.zeros_like(splats.opacities)
+    d_colors = np.zeros_like(colors)
+    d_depths = np.zeros_like(splats.depths)
     d_background = np.einsum("hw,hwc->c", rendered.transmittance, d_image)
 
     transmittance = rendered.transmittance.copy()
-    suffix_sum = transmittance * (d_image @ background)
+    suffix_sum = transmittance * (d_image @ np.asarray(background))
     for rank in reversed(range(len(order))):
         i, box = order[rank], boxes[rank]
-        splat = _footprint(box, means2d[i], conics[i], opacities[i])
+        splat = _footprint(splats, i, centers[box])
         alpha = np.minimum(splat.raw_alpha, ALPHA_MAX)
-        contributes = (rank < rendered.stops[box]) & (alpha >= ALPHA_CUT)
+        contributes = (rank < rendered.stops[box]) & (alpha >= cuts[i])
         alpha = np.where(contributes, alpha, 0.0)
 
         transmittance[box] /= 1 - alpha
         weight = transmittance[box] * alpha
-        value = d_image[box] @ colors[i] + d_alpha[box] + d_depth[box] * depths[i]
+        value = d_image[box] @ colors[i] + d_alpha[box] + d_depth[box] * splats.depths[i]
         d_splat_alpha = transmittance[box] * value - suffix_sum[box] / (1 - alpha)
         suffix_sum[box] += weight * value
 
@@ -659,12 +614,9 @@ def composite_gradients(
         d_power = d_splat_alpha * alpha
 
         # dp/dA = -d d^T / 2 and, since d = pixel - mean2d, dp/dmean2d = A d.
-        sum_dx, sum_dy = np.sum(d_power * splat.dx), np.sum(d_power * splat.dy)
-        sum_dxdx = np.sum(d_power * splat.dx * splat.dx)
-        sum_dxdy = np.sum(d_power * splat.dx * splat.dy)
-        sum_dydy = np.sum(d_power * splat.dy * splat.dy)
-        d_means2d[i] = conics[i] @ [sum_dx, sum_dy]
-        d_conics[i] = -0.5 * np.array([[sum_dxdx, sum_dxdy], [sum_dxdy, sum_dydy]])
+        weighted = d_power[..., None] * splat.offsets
+        d_means2d[i] = splats.conics[i] @ np.sum(weighted, axis=(0, 1))
+        d_conics[i] = -0.5 * np.einsum("hwi,hwj->ij", weighted, splat.offsets)
     return {
         "means2d": d_means2d,
         "conics": d_conics,
@@ -678,27 +630,23 @@ def composite_gradients(
 def project_gradients(
     gaussians: Gaussians,
     camera: Camera,
-    d_means2d: np.ndarray,
-    d_conics: np.ndarray,
-    d_opacities: np.ndarray,
-    d_depths: np.ndarray,
+    d_splats: dict[str, np.ndarray],
     antialiased: bool = False,
 ) -> dict[str, np.ndarray]:
     """Return the gradients with respect to means, quats, log_scales and logit_opacities.
 
-    d_means2d (N, 2), d_conics (N, 2, 2) symmetric as from ``composite_gradients``, d_opacities
-    (N,) and d_depths (N,) belong to the fields of ``Projection``. Rows that are not visible get
-    zero. A quaternion of norm zero gets zero. Where a ratio of the Jacobian is clamped, it is a
-    constant, and J still depends on z.
+    d_splats: from ``composite_gradients``. Rows that are not visible get zero, and so does a
+    quaternion of norm zero. Where a ratio of the Jacobian is clamped, it is a constant, and J still
+    depends on z.
 
     Not differentiated: the camera.
     """
     affine = local_affine(gaussians, camera)
     splats = project(gaussians, camera, antialiased)
-    opacities = sigmoid(gaussians.logit_opacities)
+    opacities, d_opacities = sigmoid(gaussians.logit_opacities), d_splats["opacities"]
 
     # A = cov2d^-1, so dA = -A dcov2d A.
-    d_cov2d = -splats.conics @ d_conics @ splats.conics
+    d_cov2d = -splats.conics @ d_splats["conics"] @ splats.conics
     d_axes2d = np.zeros_like(affine.axes2d)
     if antialiased:
         _, dets, areas = widened_covariances(affine.axes2d, LOW_PASS)
@@ -718,8 +666,8 @@ def project_gradients(
     d_scales = np.einsum("nij,nij->nj", affine.rotations, d_factors)
     d_rotations = d_factors * affine.scales[:, None, :]
 
-    d_camera_means = _camera_mean_gradients(affine, camera, d_means2d, d_jacobians)
-    d_camera_means[:, 2] += d_depths
+    d_camera_means = _camera_mean_gradients(affine, camera, d_splats["means2d"], d_jacobians)
+    d_camera_means[:, 2] += d_splats["depths"]
     gradients = {
         "means": d_camera_means @ camera.rotation,
         "quats": _quat_gradients(gaussians.quats, d_rotations),
@@ -788,22 +736,22 @@ def _quat_gradients(quats: np.ndarray, d_rotations: np.ndarray) -> np.ndarray:
 
 
 def sh_colors_gradients(
-    gaussians: Gaussians, camera: Camera, degree: int, d_colors: np.ndarray
+    gaussians: Gaussians, camera: Camera, degree: int | None, d_colors: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return the gradients with respect to means, sh0 and shN, given d_colors (N, 3).
 
     A mean acts through the direction in which it is seen. Where a colour is clamped to zero its
     gradient is zero; so is that of the coefficients above ``degree``.
     """
+    degree = gaussians.sh_degree if degree is None else degree
+    used = slice((degree + 1) ** 2)
     directions, distances = _view_directions(gaussians, camera)
-    coefficients = _sh_coefficients(gaussians, degree)
     d_colors = np.where(unclamped_colors(gaussians, directions, degree) >= 0, d_colors, 0.0)
 
-    d_coefficients = np.einsum("nk,nc->nkc", sh_basis(directions, degree), d_colors)
-    d_sh = np.zeros((len(gaussians.means), 1 + gaussians.shN.shape[1], 3))
-    d_sh[:, : (degree + 1) ** 2] = d_coefficients
+    d_sh = np.zeros_like(gaussians.sh)
+    d_sh[:, used] = np.einsum("nk,nc->nkc", sh_basis(directions, degree), d_colors)
 
-    d_basis = np.einsum("nkc,nc->nk", coefficients, d_colors)
+    d_basis = np.einsum("nkc,nc->nk", gaussians.sh[:, used], d_colors)
     d_directions = np.einsum("nkx,nk->nx", sh_basis_gradient(directions, degree), d_basis)
     return {
         "means": _normalize_gradients(directions, distances, d_directions),
@@ -817,50 +765,33 @@ def render_gradients(
     camera: Camera,
     background: ArrayLike,
     d_image: np.ndarray,
-    d_alpha: np.ndarray | None = None,
-    d_depth: np.ndarray | None = None,
+    d_alpha: ArrayLike = 0.0,
+    d_depth: ArrayLike = 0.0,
     sh_degree: int | None = None,
     antialiased: bool = False,
 ) -> dict[str, np.ndarray]:
     """Return the gradients of L = sum d_image image + sum d_alpha alpha + sum d_depth depth.
 
-    d_image (H, W, 3); d_alpha and d_depth (H, W), None for zero; the rest as in ``render``. The
+    d_image (H, W, 3), d_alpha, d_depth: see ``composite_gradients``; the rest as in ``render``. The
     result has the six fields of ``Gaussians`` in their shapes, ``background`` (3,), and
     ``means2d`` (N, 2), per pixel of position on the film. Not differentiated: see
     ``composite_gradients`` and ``project_gradients``.
     """
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
     splats = project(gaussians, camera, antialiased)
-    colors = sh_colors(gaussians, camera, degree)
-    d_splats = composite_gradients(
-        splats.means2d, splats.conics, splats.opacities, colors, splats.depths, splats.visible,
-        background, camera.width, camera.height, d_image, d_alpha, d_depth,
-    )  # fmt: skip
-    through_projection = project_gradients(
-        gaussians, camera, d_splats["means2d"], d_splats["conics"], d_splats["opacities"],
-        d_splats["depths"], antialiased,
-    )  # fmt: skip
-    through_color = sh_colors_gradients(gaussians, camera, degree, d_splats["colors"])
+    colors = sh_colors(gaussians, camera, sh_degree)
+    d_splats = composite_gradients(splats, colors, background, d_image, d_alpha, d_depth)
+    through_projection = project_gradients(gaussians, camera, d_splats, antialiased)
+    through_color = sh_colors_gradients(gaussians, camera, sh_degree, d_splats["colors"])
     return {
+        **through_projection,
+        **through_color,
         "means": through_projection["means"] + through_color["means"],
-        "quats": through_projection["quats"],
-        "log_scales": through_projection["log_scales"],
-        "logit_opacities": through_projection["logit_opacities"],
-        "sh0": through_color["sh0"],
-        "shN": through_color["shN"],
         "background": d_splats["background"],
         "means2d": d_splats["means2d"],
     }
 
 
-# ----------------------------------------------------------------------------------------------
-# Small helpers
-# ----------------------------------------------------------------------------------------------
-
-
-def _as_float64(*arrays: ArrayLike) -> list[np.ndarray]:
-    """Return the arrays in double precision, so that kernels' own splats may be composited."""
-    return [np.asarray(array, dtype=np.float64) for array in arrays]
+# ---- Small helpers ---------------------------------------------------------------------------
 
 
 def _normalize(vectors: np.ndarray, fallback: tuple) -> tuple[np.ndarray, np.ndarray]:

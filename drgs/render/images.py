@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Iterator, Sequence
 
@@ -20,12 +19,12 @@ from drgs.cameras.viewpoints import (
 )
 from drgs.config.schema import FitConfig
 from drgs.core.constants import SHUTTER_SAMPLES
-from drgs.core.files import atomic_path
+from drgs.core.files import write_json
 from drgs.datasets.camera_file import read_viewpoints
 from drgs.effects.cameras import CAMERAS, CamerasConfig
 from drgs.io.images import check_animation, write_animation
 from drgs.results.files import METRICS, ORBIT
-from drgs.results.metrics import Quality, mean_of, psnr, ssim
+from drgs.results.metrics import mean_of, psnr, ssim
 from drgs.results.model import ImageFolder, Model
 from drgs.results.model_arguments import UP
 from drgs.results.refined_cameras import training_cameras
@@ -48,7 +47,7 @@ def render_model(args: argparse.Namespace, model: Model, folder: ImageFolder) ->
     folder.write_budget()
 
 
-def render_split(model: Model, split: str, folder: ImageFolder) -> Quality:
+def render_split(model: Model, split: str, folder: ImageFolder) -> None:
     """Render the views of a dataset's split, measure them, and print and write the result."""
     dataset = model.dataset(f"--split {split}")
     print(dataset.description)
@@ -56,13 +55,13 @@ def render_split(model: Model, split: str, folder: ImageFolder) -> Quality:
     column = max(len("view"), *(len(view.name) for view in views))
     images = model.images(views, folder, [METRICS], "give --set data.image_size=...")
     print(f"{'view':{column}}  PSNR [dB]    SSIM")
-    scores = []
+    scores: dict[str, dict[str, float]] = {}
     for view, image in zip(views, images, strict=True):
         folder.write_png(f"{view.name}.png", image)
         pair = image, view.image, view.mask
-        scores.append({"psnr": psnr(*pair), "ssim": ssim(*pair)})
-        print(f"{view.name:{column}}  {_line(**scores[-1])}", flush=True)
-    quality = mean_of([(score["psnr"], score["ssim"]) for score in scores])
+        score = scores[view.name] = {"psnr": psnr(*pair), "ssim": ssim(*pair)}
+        print(f"{view.name:{column}}  {_line(**score)}", flush=True)
+    quality = mean_of([(score["psnr"], score["ssim"]) for score in scores.values()])
     mean = {"psnr": quality.psnr, "ssim": quality.ssim}
     print(f"{'mean':{column}}  {_line(**mean)}")
     report = {
@@ -70,11 +69,9 @@ def render_split(model: Model, split: str, folder: ImageFolder) -> Quality:
         "num_views": quality.num_views,
         "num_gaussians": model.gaussians.num_gaussians,
         "mean": mean,
-        "views": {view.name: score for view, score in zip(views, scores, strict=True)},
+        "views": scores,
     }
-    with atomic_path(folder.path / METRICS) as temporary:
-        temporary.write_text(json.dumps(_replace_infinities(report), indent=2) + "\n")
-    return quality
+    write_json(folder.path / METRICS, _replace_infinities(report), indent=2)
 
 
 def render_orbit(model: Model, args: argparse.Namespace, folder: ImageFolder) -> None:

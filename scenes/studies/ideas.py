@@ -48,7 +48,7 @@ from drgs.training.density.budget import GROWTH_SHARE, GrowthToNumber
 from drgs.training.density.strategy import DensityReport
 from drgs.training.losses import Loss, LossTerm, PhotometricLoss
 from drgs.training.optimizer import Population
-from drgs.training.steps import Stage
+from drgs.training.steps import ResolutionPhase
 from drgs.training.trainer import Trainer
 from fits import SCENES as SCENES_FOLDER
 from fits import add_case_option, make_parser, write_curves
@@ -460,8 +460,8 @@ class EverySecondAtHalfSize(Change):
         trainer.density.coarse = ()
 
 
-class _Kept(Stage):
-    """A stage that keeps its targets when another one begins."""
+class _Kept(ResolutionPhase):
+    """A phase that keeps its targets when another one begins."""
 
     @override
     def end(self) -> None:

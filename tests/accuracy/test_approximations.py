@@ -1,13 +1,11 @@
 """Windows, faint splats, kernels and messages of approximations, beyond the laws of images."""
 
-import json
 import math
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from conftest import TESTS
 from support.cases import APPROXIMATIONS, CASES
 from support.helpers import (
     FLOAT32,
@@ -129,51 +127,6 @@ def test_equal_approximations_make_equal_pipelines():
         assert values == {} or pipeline_of(Approximations(**values), 2) != pipeline_of(
             Approximations(), 2
         )
-
-
-CHOSEN_MODULES = ("exact", "pixel_order", "ray_colors", "unscented")
-
-PROGRAM = """
-import json, sys
-sys.path.insert(0, {tests!r})
-for name in {blocked!r}:
-    sys.modules["drgs.accuracy." + name] = None  # importing it raises ImportError
-from support.kernels import kernels_of_a_frame
-from drgs.accuracy.pipeline import pipeline_of
-from drgs.config.approximations import Approximations
-print(json.dumps(kernels_of_a_frame(pipeline_of(Approximations(**{approximations!r}), 2))))
-"""
-
-
-def kernels_in_a_new_process(run_python, blocked, **approximations):
-    program = PROGRAM.format(tests=TESTS, blocked=blocked, approximations=approximations)
-    return run_python(program)
-
-
-@pytest.mark.slow
-def test_unused_approximation_costs_nothing(run_python):
-    """Hash and operation count of the default's kernels, with all other modules out of reach."""
-    results = [kernels_in_a_new_process(run_python, blocked) for blocked in ((), CHOSEN_MODULES)]
-    assert [r.returncode for r in results] == [0, 0], results[1].stderr
-    whole, reduced = (json.loads(r.stdout) for r in results)
-    assert whole == reduced and all(len(kernels) >= 3 for kernels in whole.values())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("module", "approximations"),
-    [
-        ("exact", {"projection": "exact"}),
-        ("unscented", {"projection": "unscented"}),
-        ("pixel_order", {"order": "pixel"}),
-        ("ray_colors", {"sh_direction": "pixel"}),
-    ],
-)
-def test_missing_module_fails_only_when_its_approximation_is_chosen(
-    run_python, module, approximations
-):
-    result = kernels_in_a_new_process(run_python, (module,), **approximations)
-    assert result.returncode != 0 and f"drgs.accuracy.{module}" in result.stderr
 
 
 def test_no_kernel_of_an_approximation_reduces_floats_in_memory():

@@ -14,8 +14,17 @@ from unittest import mock
 import drjit as dr
 import numpy as np
 import pytest
-from support.conditioning import U, color_share, opacity_size, rms, rounded_inputs
-from support.hard_cases import EXACT, FAMILIES, bound_of, errors_over_bounds
+from support.hard_cases import (
+    EXACT,
+    FAMILIES,
+    U,
+    bound_of,
+    color_share,
+    errors_over_bounds,
+    opacity_size,
+    rms,
+    rounded_inputs,
+)
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -91,7 +100,7 @@ def noises(case, pipeline, weights, base) -> tuple[dict, dict]:
 
 
 def rounded_appearance(rng, gaussians) -> reference.Gaussians:
-    """Opacities and colours moved as in ``conditioning``: also by the roundings of the sums that
+    """Opacities and colours moved as in ``hard_cases``: also by the roundings of the sums that
     they are added to.
     """
     opacities = reference.sigmoid(gaussians.logit_opacities)

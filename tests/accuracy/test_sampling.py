@@ -1,7 +1,6 @@
 """Several samples per pixel: kernels against the reference, films against the definition."""
 
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -9,8 +8,8 @@ import numpy as np
 import pytest
 from support.backgrounds import CLOSE, EMITTERS, rendered, texels
 from support.cases import CASES, MODEL_FIELDS, planes_of, reference_camera
-from support.helpers import FLOAT64, NEAR_THRESHOLD, single
-from support.views import VIEWS, Scene, image_of, side_by_side, tensors
+from support.helpers import FLOAT64, NEAR_THRESHOLD
+from support.views import VIEWS, Scene, image_of, side_by_side
 from support.wall_scenes import Wall
 from support.wall_scenes import load as load_wall
 
@@ -250,41 +249,6 @@ def test_no_samples_outside_the_film():
     np.testing.assert_allclose(*images, rtol=0, atol=1e-5)
 
 
-def test_a_box_filter_gives_the_same_bytes_in_every_run():
-    results = []
-    for _ in range(2):
-        loaded = SCENE.load(samples=4)
-        params = mi.traverse(loaded)
-        dr.enable_grad(params["integrator.means"])
-        image = mi.render(loaded, params)
-        dr.backward(dr.sum(dr.square(image), axis=None))
-        results.append([np.array(image), np.array(dr.grad(params["integrator.means"]))])
-    assert all(a.tobytes() == b.tobytes() for a, b in zip(*results, strict=True))
-
-
-def test_more_samples_converge_to_the_pixel_area():
-    """Splats smaller than a pixel, no low-pass: a pixel is the mean over its area. Errors of
-    stratified samples fall at least as 1 / sqrt(n).
-    """
-    gaussians = SCENE.gaussians
-    small = replace(gaussians, log_scales=single(gaussians.log_scales - 2.5))
-    settings = SCENE.settings | {"low_pass": 0.0}
-
-    def image(samples, seed):
-        loaded = mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": settings | tensors(small),
-                "sensor": SCENE.view.sensor(samples=samples, sampler="stratified"),
-            }
-        )
-        return image_of(loaded, seed=seed)
-
-    exact = image(256, 1)
-    errors = [np.sqrt(np.mean((image(n, 2) - exact) ** 2)) for n in (1, 4, 16, 64)]
-    assert all(after < 0.7 * before for before, after in pairwise(errors)), errors
-
-
 # ----------------------------------------------------------------------------------------------
 # Several samples a pass
 # ----------------------------------------------------------------------------------------------
@@ -292,10 +256,7 @@ def test_more_samples_converge_to_the_pixel_area():
 SMALL_SCENE = Scene(count=12, degree=1)
 
 
-def scene_with(settings=(), sensor=None, **objects):
-    integrator = SMALL_SCENE.settings | tensors(SMALL_SCENE.gaussians) | dict(settings)
-    sensor = SMALL_SCENE.view.sensor() if sensor is None else sensor
-    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **objects})
+scene_with = SMALL_SCENE.load_with
 
 
 def batch_of_two():
@@ -319,22 +280,22 @@ def feature_tensor(channels):
 
 
 SCENES = {
-    "plain": lambda: scene_with(),
-    "linear, antialiased": lambda: scene_with({"srgb_primitives": True, "antialiased": True}),
-    "exact, order of each pixel": lambda: scene_with({"projection": "exact", "order": "pixel"}),
+    "plain": scene_with,
+    "linear, antialiased": lambda: scene_with(srgb_primitives=True, antialiased=True),
+    "exact, order of each pixel": lambda: scene_with(projection="exact", order="pixel"),
     "unscented, colours of each pixel": lambda: scene_with(
-        {"projection": "unscented", "sh_direction": "pixel", "low_pass": 0.0}
+        projection="unscented", sh_direction="pixel", low_pass=0.0
     ),
     "features in groups": lambda: scene_with(
-        {"aovs": "z:depth, n:normal, f:feature_f", "feature_f": feature_tensor(4)}
+        aovs="z:depth, n:normal, f:feature_f", feature_f=feature_tensor(4)
     ),
-    "texture": lambda: scene_with({"background": rendered(texels())}),
-    "environment, thin lens": lambda: scene_with(sensor=thin_lens(), sky=EMITTERS["envmap"]()),
+    "texture": lambda: scene_with(background=rendered(texels())),
+    "environment, thin lens": lambda: scene_with(thin_lens(), {"sky": EMITTERS["envmap"]()}),
     "surface, environment": lambda: load_wall(
         SMALL_SCENE, sky=True, wall=Wall(half=0.5), aovs="z:depth"
     ),
-    "batch": lambda: scene_with({"aovs": "z:depth"}, batch_of_two()),
-    "motion": lambda: scene_with(sensor=moving()),
+    "batch": lambda: scene_with(batch_of_two(), aovs="z:depth"),
+    "motion": lambda: scene_with(moving()),
 }
 
 
@@ -387,7 +348,7 @@ def test_passes_of_several_samples_equal_single_sample_passes(name, monkeypatch)
 
 def test_a_pass_of_a_large_film_has_one_sample():
     film = {"width": 512, "height": PIXELS_PER_PASS // 512 + 1}
-    large = scene_with(sensor=SMALL_SCENE.view.sensor(**film)).sensors()[0]
+    large = scene_with(SMALL_SCENE.view.sensor(**film)).sensors()[0]
     assert [p.samples for p in DrawnSamples(large, 0, 3, {}).positions] == [1, 1, 1]
     small = scene_with().sensors()[0]
     at_once = PIXELS_PER_PASS // (SMALL_SCENE.view.width * SMALL_SCENE.view.height)

@@ -77,19 +77,3 @@ def test_splat_over_a_pole_is_round():
     np.testing.assert_allclose(alpha, np.tile(expected[:, None], WIDTH), atol=0.004)
     # A mean on the axis itself has no longitude.
     assert planes_of(gaussians_at([[0, 2.0, 0]], 0.2, 0.8))[0].min() == 1
-
-
-def test_rays_and_places_belong_to_each_other():
-    camera = camera_at_origin(width=WIDTH, height=HEIGHT)
-    camera = device_camera(camera, FLOAT64).with_lens(Equirectangular())
-    rng = np.random.default_rng(0)
-    film = rng.random((2, 500)) * [[WIDTH], [HEIGHT]]
-    film[0, :2] = 0, WIDTH  # the seam, from both sides
-    x, y = (FLOAT64.Float(column) for column in film)
-    _, direction, seen = camera.look_through(x, y)
-    assert np.array(seen).all()
-    place = camera.lens.project_point(camera, direction)
-    np.testing.assert_allclose(np.array(place)[:, 2:], film[:, 2:], atol=1e-11)
-    theta, phi = 2 * np.pi * (film[0] / WIDTH - 0.5), np.pi * (film[1] / HEIGHT - 0.5)
-    turns = Rotation.from_euler("YX", np.column_stack([theta, -phi]))  # right, then down
-    np.testing.assert_allclose(np.array(direction).T, turns.apply([0, 0, 1]), atol=1e-12)

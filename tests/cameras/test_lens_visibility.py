@@ -1,11 +1,14 @@
-"""The region that a lens sees, and rays within it."""
+"""The region that a lens sees, rays within it, and images of hard scenes."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from support.cases import edges_behind, large_behind, reference_camera, with_lens
 from support.helpers import FLOAT32, FLOAT64, both_precisions, rows, single
 from support.lens_scenes import (
+    IMAGE,
     LENSES,
     camera_behind,
     covariances,
@@ -23,7 +26,7 @@ from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye as CameraThinPrismFisheye
 from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.reference.effects import Fisheye, OpenCV, Orthographic, ThinPrismFisheye
+from drgs.reference.effects import Fisheye, OpenCV, ThinPrismFisheye
 
 # ----------------------------------------------------------------------------------------------
 # Visibility
@@ -194,27 +197,6 @@ def rays_of(camera, lens, film, precision) -> np.ndarray:
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-@both_precisions
-@every_lens
-def test_points_of_a_ray_project_to_its_pixel(precision, name):
-    """The reference projects points of rays, wherever the lens shows anything."""
-    lens, camera = LENSES[name], camera_behind(LENSES[name])
-    y, x = np.mgrid[: camera.height, : camera.width].reshape(2, -1) + 0.5
-    film = np.column_stack([x, y])
-    film = np.vstack([film, [[camera.cx, camera.cy]]])
-    points = points_at(lens, camera, film, np.ones(len(film)))
-    if isinstance(lens, Orthographic):
-        points = np.tile([0, 0, 1.0], (len(film), 1))
-    shown = ~np.isnan(points).any(axis=1)
-    assert shown.all() == (name != "barrel")
-    rays = rays_of(camera, lens, film, precision)
-    assert np.isfinite(rays).all()
-    expected = points / np.linalg.norm(points, axis=1, keepdims=True)
-    # The reciprocal of the slope of the distorted radius, next to the fold, times a rounding.
-    tolerance = {FLOAT64: 1e-12, FLOAT32: 2e-5}[precision]
-    np.testing.assert_allclose(rays[shown], expected[shown], rtol=0, atol=tolerance)
-
-
 @pytest.mark.slow
 @both_precisions
 @pytest.mark.parametrize(
@@ -249,3 +231,27 @@ def test_rays_of_extreme_lenses_are_found_and_finite(precision, kind, sizes):
         np.testing.assert_allclose(rays[found], expected, rtol=0, atol=tolerance, err_msg=str(lens))
         shown += found.sum()
     assert shown > 1500
+
+
+# ----------------------------------------------------------------------------------------------
+# Images
+# ----------------------------------------------------------------------------------------------
+
+
+@both_precisions
+@every_lens
+@pytest.mark.parametrize(("scene", "count"), [(edges_behind, 60), (large_behind, 30)])
+def test_image_equals_the_reference(precision, name, scene, count):
+    """The reference evaluates every splat at every pixel."""
+    lens = LENSES[name]
+    case = with_lens(name, scene=partial(scene, lens), count=count)
+    expected, marked = case.reference_image
+    found = case.planes(case.values, precision.Float)
+    for plane, values in zip(found, expected, strict=True):
+        tolerance = IMAGE[precision] * np.abs(values).max()
+        np.testing.assert_allclose(plane[~marked], values[~marked], rtol=0, atol=tolerance)
+    splats = effects.project(reference.Gaussians(**case.values), reference_camera(case), lens)
+    x, y = splats.means2d[splats.visible].T
+    beside = (x < 0) | (y < 0) | (x > case.width) | (y > case.height)
+    assert (beside.sum() >= 5 or name == "panorama") and (expected[0] < 0.5).mean() > 0.2
+    assert marked.mean() < 0.01

@@ -382,7 +382,7 @@ OPTIONS = [
     (["--size", 4000, 4000], "4000 x 4000 px need about 4 GB of memory, of which 2 GB are avail"),
     (["--fov", 181], "--fov: must be between 0 and 180 degrees, got 181"),
     (["--distance", -1], "distance must be > 0, got -1"),
-    (["--distance", 1e300], "no camera may be farther from the scene than 100000 of its"),
+    (["--distance", 1e300], "the coordinates of origin must be at most 1e+09 in size"),
     (["--distance", 3, "--target", 900, 0, 0], "the cameras see nothing of the scene"),
     (["--target", 0, "inf", 0], "--target: must be a finite number, got inf"),
     (["--points", 10**9], "--points: must be at most 5,000,000"),

@@ -258,19 +258,6 @@ def test_fit_without_a_report_writes_everything_else(tmp_path):
     assert measured == [True, False]
 
 
-@pytest.mark.slow
-def test_fit_with_all_effects_writes_their_files(tmp_path, monkeypatch):
-    without_images(monkeypatch)
-    config = write_project(
-        tmp_path,
-        model={"sh_degree": 1, "sh_increase_every": 2, "smoothing": True},
-        colors={"lr": 0.02},
-        cameras={"optimise": True, "focal_lr": 1e-4, "principal_lr": 1e-4},
-    )
-    assert_fits(config, "--out", tmp_path / "out")
-    assert (tmp_path / "out" / "cameras.json").is_file()
-
-
 def test_photographs_that_are_left_out_are_not_fitted(tmp_path, monkeypatch):
     without_images(monkeypatch)
     project, out = write_project(tmp_path), tmp_path / "out"

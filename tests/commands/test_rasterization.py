@@ -1,17 +1,18 @@
 """``drgs.rasterization`` against the float64 reference and central differences."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
 import pytest
 from support.helpers import Case, bitwise, clear
-from support.kernels import float_reductions
+from support.kernels import float_reductions, kernels_of
 
 import drgs
 from drgs.reference import splatting as reference
+from drgs.splatting.order import FEATURES_AT_ONCE
 
 CASE = Case("front door", width=21, height=18, degree=3, count=24)
 
@@ -109,6 +110,37 @@ def test_colors_of_any_number_of_channels_are_composited():
     np.testing.assert_array_equal(twice[0], images[0])
     missing = (1 - alphas[1]) * backgrounds[1]
     np.testing.assert_allclose(twice[1] - missing, 2 * (images[1] - missing), atol=1e-12)
+
+
+def many_channels(kind, channels):
+    """One camera, and random colours."""
+    arrays = {k: v[:1] if k in ("viewmats", "Ks") else v for k, v in scene().items()}
+    del arrays["backgrounds"]
+    arrays["colors"] = np.random.default_rng(4).uniform(size=(CASE.count, channels))
+    return {name: value.astype(kind) for name, value in arrays.items()}
+
+
+@pytest.mark.parametrize("size", FEATURES_AT_ONCE)
+def test_grouped_channels_equal_channels_rendered_alone(size):
+    """Two whole groups, and a part of one."""
+    kind, most = {4: np.float32, 8: np.float64}[size], FEATURES_AT_ONCE[size]
+    given = many_channels(kind, 2 * most + 3 if size == 8 else most + 3)
+    many, alphas, _ = drgs.rasterization(**given, **FILM)
+    for start in range(0, many.shape[-1], most):
+        few = {**given, "colors": given["colors"][:, start : start + most]}
+        expected, expected_alphas, _ = drgs.rasterization(**few, **FILM)
+        np.testing.assert_array_equal(many[..., start : start + most], expected)
+        np.testing.assert_array_equal(alphas, expected_alphas)
+
+
+def test_groups_share_their_kernels():
+    """The largest, which composites, is that of a whole group, however many there are."""
+    found = []
+    for groups in (2, 3):
+        given = many_channels(np.float64, groups * FEATURES_AT_ONCE[8])
+        kernels = kernels_of(partial(drgs.rasterization, **given, **FILM))
+        found.append(max(kernels, key=lambda kernel: kernel[1]))
+    assert found[0] == found[1]
 
 
 def test_depths_are_sums_or_expectations_in_the_last_channel():
@@ -295,6 +327,11 @@ REFUSED = [
     ({"sh_degree": 4}, "sh_degree must be None or 0 to 3, got 4"),
     ({"render_mode": "depth"}, "render_mode must be one of .*, got 'depth'"),
     ({"width": 0}, "width and height must be 1 px or more"),
+    ({"width": 10**6, "height": 10**6}, r"width and height must be smaller: .* too many"),
+    (
+        {**FLAT, "colors": np.ones((24, 2000)), "backgrounds": None},
+        "colors must be of at most 64 channels, got 2000",
+    ),
     ({"eps2d": -1.0}, "eps2d must be finite and not negative, got -1.0"),
     ({"projection": "affine"}, "projection must be one of ewa, exact, unscented"),
     ({"packed": False}, "packed is a parameter of gsplat's .*; leave it out"),

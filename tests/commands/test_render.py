@@ -158,22 +158,6 @@ def test_moving_camera_of_a_file_blurs_the_image(fit, tmp_path):
         assert np.abs(shown[first] - shown[second]).max() > 0.05, (first, second)
 
 
-@pytest.mark.parametrize("ignored", [(), ("distortion", "motion")])
-def test_plan_covers_all_cameras_and_lists_ignored_effects(fit, tmp_path, capsys, ignored):
-    path = write_camera(tmp_path / "c.json", POSE, POSE, k1=0.1)
-    values = json.loads(path.read_text())
-    plain = {"transform_matrix": values["frames"][0]["transform_matrix"]}
-    path.write_text(json.dumps(values | {"frames": [plain, *values["frames"]]}))
-    ignore = ["--ignore", *ignored] if ignored else []
-    run(fit, "--camera", path, *ignore, "--out", tmp_path / "out")
-    said = capsys.readouterr().out
-    if ignored:
-        assert "  not simulated: lens distortion (ignored), motion (ignored), anti" in said
-    else:
-        assert "  lens distortion: opencv (k1) (1 of 2 cameras)\n" in said
-        assert "  motion: global shutter (1 of 2 cameras)\n" in said
-
-
 def test_camera_set_by_options_is_used(fit, tmp_path):
     """A file's background is black; a folder's is that of its configuration."""
     words = ["--origin", *POSE[:3, 3], "--target", *FOCUS, "--fov", np.degrees(FIELD_OF_VIEW)]

@@ -1,4 +1,4 @@
-"""Depths of views from meshes and point clouds, against rays and triangles in numpy."""
+"""Positions of points in images, and depths of views from meshes and point clouds, in numpy."""
 
 from dataclasses import replace
 
@@ -13,6 +13,7 @@ from drgs.cameras.viewpoints import CameraMotion
 from drgs.config.load import config_from
 from drgs.core.errors import UserError
 from drgs.datasets import load_dataset
+from drgs.datasets.film import to_camera, to_film
 from drgs.datasets.surface_depths import with_depths_from
 from drgs.datasets.types import all_views
 
@@ -52,6 +53,25 @@ def lens_view(name):
     lens = LENSES[name]
     host = None if lens is PINHOLE else kernel_lens(lens)
     return lens, replace(view_at((3, -2, 1), (0.25, 0, 0)), lens=host, fy=35.0, cx=17.0)
+
+
+@pytest.mark.parametrize("name", ["pinhole", "rational", "fisheye", "thin prism"])
+def test_projected_points_match_the_reference(name):
+    lens, view = lens_view(name)
+    camera = reference_camera(view, near=1e-9)
+    points = np.random.default_rng(0).uniform(-6, 6, (500, 3))
+    points[0] = view.center + 2 * view.camera_to_world[:3, 2]  # on the optical axis
+    position = (points - view.center) @ view.camera_to_world[:3, :3]
+    actual = to_camera(view, points.T)
+    np.testing.assert_allclose(np.stack(actual, axis=1), position, atol=1e-12)
+    u, v, depth = to_film(view, actual)
+    assert (u[0], v[0], depth[0]) == pytest.approx((17, 15, 2))
+    seen = lens.is_seen(camera, position)
+    np.testing.assert_array_equal(depth > 0, seen)
+    assert 100 < seen.sum() < 500 and np.isfinite([u, v]).all()
+    np.testing.assert_allclose(depth[seen], lens.depths(camera, position)[seen], rtol=1e-12)
+    expected = lens.film_points(camera, position)[seen]
+    np.testing.assert_allclose(np.stack([u, v], axis=1)[seen], expected, rtol=1e-9, atol=1e-9)
 
 
 def depth_from(path, *views):

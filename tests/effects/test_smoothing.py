@@ -5,7 +5,8 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
+from support.cases import rates_of, smoothed_reference
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -20,7 +21,6 @@ from support.helpers import (
     rows,
     single,
 )
-from support.smoothing import rates_of, smoothed_reference
 from support.views import Scene, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
@@ -165,19 +165,6 @@ def test_nonfinite_filter_is_refused(tmp_path):
     message = "smoothing of Gaussian 3 must be finite, got nan"
     with pytest.raises(UserError, match=message):
         Gaussians.load(tmp_path / "a.ply")
-
-
-def test_filter_of_another_type_is_read(tmp_path):
-    """Tools that compute in double precision write such files."""
-    gaussians = with_filter()
-    gaussians.save(tmp_path / "a.ply")
-    vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
-    kinds = [(n, "f8" if n == "filter_3D" else "f4") for n in reversed(vertex.dtype.names)]
-    other = np.empty(len(vertex), kinds)
-    for name, _ in kinds:
-        other[name] = vertex[name]
-    PlyData([PlyElement.describe(other, "vertex")]).write(str(tmp_path / "b.ply"))
-    np.testing.assert_array_equal(Gaussians.load(tmp_path / "b.ply").smoothing, gaussians.smoothing)
 
 
 # ----------------------------------------------------------------------------------------------

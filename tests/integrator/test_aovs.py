@@ -28,11 +28,9 @@ def composited(gaussians, camera, columns) -> np.ndarray:
     """(H, W, C): columns (N, C) of numbers, each weighted by its share in the pixel."""
     splats = reference.project(gaussians, camera)
     planes = []
-    for k in range(columns.shape[1]):
-        rendered = reference.composite(
-            splats.means2d, splats.conics, splats.opacities, np.repeat(columns[:, k : k + 1], 3, 1),
-            splats.depths, splats.visible, np.zeros(3), camera.width, camera.height,
-        )  # fmt: skip
+    for column in columns.T:
+        colors = np.repeat(column[:, None], 3, 1)
+        rendered = reference.composite(splats, colors, np.zeros(3), camera.width, camera.height)
         planes.append(rendered.image[..., 0])
     return np.stack(planes, axis=-1)
 

@@ -6,9 +6,7 @@ from plugin_parameters import parameters_of
 from support.viewer_rendering import VIEWER_RENDERING
 
 from drgs.config.approximations import DECLARED, Approximations
-from drgs.config.load import load_config
 from drgs.config.schema import ModelConfig
-from drgs.core.errors import UserError
 
 KINDS = {bool: "bool", int: "int", float: "float", str: "string"}
 
@@ -39,10 +37,3 @@ def test_unrounded_default_counts_as_default():
     assert written.approximations.non_default == {}
     chosen = ModelConfig(alpha_max=0.98, extent=3.0, **VIEWER_RENDERING).approximations
     assert chosen.non_default == {"alpha_max": 0.98, "extent": 3.0}
-
-
-def test_value_that_rounds_to_a_limit_in_float32_is_refused(tmp_path):
-    path = tmp_path / "x.yml"
-    path.write_text("data: {path: lego}\nmodel: {alpha_max: 0.999999999}\n")
-    with pytest.raises(UserError, match=r"model.alpha_max must be above 0 and below 1 in float32"):
-        load_config(path)

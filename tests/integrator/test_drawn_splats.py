@@ -12,11 +12,7 @@ from support.reference_lenses import gaussians_at
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.integrator.light.rays import PathSegment
-from drgs.integrator.light.splat_transport import (
-    DECODING,
-    ROULETTE_TRANSMITTANCE,
-    RayTransport,
-)
+from drgs.integrator.light.splat_transport import DECODING, ROULETTE_TRANSMITTANCE, RayTransport
 from drgs.light.walk import _hashes
 from drgs.splatting.footprint import Cutoffs
 

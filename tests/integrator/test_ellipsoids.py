@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import drjit as dr
-import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -26,14 +25,18 @@ from support.ellipsoids import (
     held_gradients,
     joined,
     scene_with,
+    shape_of,
     transform,
 )
 from support.helpers import assert_arrays_agree, clear, single
+from support.kernels import float_reductions
 from support.splats_checks import GRADIENTS, IMAGE, assert_images_agree, write_gaussians
 from support.views import VIEWS, Scene, gradient, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.integrator import parts
+from drgs.splatting import rendering
 
 KINDS = ("ellipsoids", "ellipsoidsmesh")
 
@@ -204,23 +207,84 @@ def test_shipped_model_is_the_output_of_its_program(monkeypatch):
     np.testing.assert_allclose(np.abs(cosines), 1, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_shipped_scene_is_compared_with_volprim(monkeypatch, tmp_path, capsys):
-    """On a film so small that the low-pass of 0.3 px^2 shows: 24 dB; a mirrored one has 10."""
-    monkeypatch.syspath_prepend(SCENES)
-    import compare_shapes
+# ----------------------------------------------------------------------------------------------
+# Gradients
+# ----------------------------------------------------------------------------------------------
 
-    monkeypatch.setattr(compare_shapes, "REPEATS", {"volprim_rf_basic": 1, "splats": 1})
-    model = str(SCENES / "shapes" / "knot.ply")
-    for arguments in ([], [model]):
-        options = [*arguments, "--size", "48", "--out", str(tmp_path / "shapes.png")]
-        monkeypatch.setattr("sys.argv", ["compare_shapes.py", *options])
-        compare_shapes.main()
-        lines = capsys.readouterr().out.splitlines()
-        assert [line.partition(":")[0] for line in lines[1:4]] == [
-            "volprim_rf_basic",
-            "splats",
-            "ratio of the times",
-        ]
-        assert float(lines[4].removesuffix(" dB").rpartition(" ")[2]) > 20
-        assert iio.imread(tmp_path / "shapes.png").shape[:2] > (300, 600)
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        *(EllipsoidsCase(degree=degree) for degree in (0, 1, 3)),
+        EllipsoidsCase(degree=3, srgb_primitives=True),
+        EllipsoidsCase(kind="ellipsoidsmesh"),
+    ],
+    ids=["degree 0", "degree 1", "degree 3", "linear", "mesh"],
+)
+def test_gradients_match_the_reference(scene):
+    scene = clear(scene)
+    expected = held_gradients(scene.held, scene.gradients(scene.weights()))
+    assert_held_agree(gradients_held(scene.load(), scene.weights()), expected)
+
+
+def test_backward_passes_give_the_same_bytes_without_float_atomics():
+    scene = Merged()
+
+    def backward():
+        return gradients_held(scene.load(), scene.weights(), "first")
+
+    found, count = float_reductions(backward)
+    assert not found and count > 5
+    first, again = backward(), backward()
+    assert all(first[name].tobytes() == again[name].tobytes() for name in SHAPE_ATTRIBUTES)
+
+
+# ----------------------------------------------------------------------------------------------
+# Caching between renderings
+# ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Names of what is called: for each frame that is rendered, and for each conversion."""
+    calls = []
+
+    def count(owner, name):
+        function = getattr(owner, name)
+
+        def counting(*arguments):
+            calls.append(name)
+            return function(*arguments)
+
+        monkeypatch.setattr(owner, name, counting)
+
+    count(rendering, "render")
+    count(parts.Conversion, "gaussians")
+    return calls
+
+
+def test_backward_pass_reuses_the_frame_and_converts_shapes_again(counted):
+    scene = EllipsoidsCase()
+    loaded = scene.load()
+    gradients_held(loaded, scene.weights())
+    image_of(loaded)
+    assert sorted(counted) == ["gaussians", "gaussians", "render"]
+
+
+@pytest.mark.parametrize("name", [*SHAPE_ATTRIBUTES, "all, and the number of rows"])
+def test_a_changed_parameter_is_rendered_again(name, counted):
+    scene = EllipsoidsCase()
+    loaded = scene.load()
+    before = image_of(loaded)
+    others = EllipsoidsCase(count=60, seed=9).held
+    held = scene.held | {name: scene.held[name] * 0.75} if name in scene.held else others
+    params = mi.traverse(loaded)
+    for key in SHAPE_ATTRIBUTES if held is others else [name]:
+        params[f"shape.{key}"] = mi.Float(held[key].ravel().astype(np.float32))
+    params.update()
+    after = image_of(loaded)
+    assert sorted(counted) == ["gaussians"] * 2 + ["render"] * 2
+    assert np.abs(after - before).max() > 0.01
+    np.testing.assert_array_equal(
+        after, image_of(scene.load_with(objects={"shape": shape_of(held)}))
+    )

@@ -5,6 +5,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.ellipsoids import scene_with
 from support.views import VIEWS, Scene, image_of, tensors
 
 from drgs.core.errors import UserError
@@ -83,14 +84,7 @@ def test_a_wrong_value_is_refused_unless_a_property_gives_another(tmp_path):
 def test_shapes_of_gaussians_ignore_the_header(file):
     """Mitsuba's loader reads the same file, comments and all, and keeps none of them."""
     shape = {"type": "ellipsoids", "filename": str(file)}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "splats"},
-            "shape": shape,
-            "sensor": VIEWS[0].sensor(),
-        }
-    )
+    scene = scene_with({}, VIEWS[0], shape=shape)
     mi.render(scene)
     assert scene.integrator().gaussians.num_gaussians == 40
     assert scene.integrator().state.approximations.non_default == {}

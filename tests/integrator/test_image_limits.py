@@ -6,7 +6,7 @@ import pytest
 from support.views import VIEWS, Scene
 from support.wall_scenes import WALL
 
-import drgs
+import drgs  # noqa: F401  (registers the plugins)
 from drgs.core.errors import PluginError
 from drgs.integrator import image_render
 from drgs.integrator.image_render import MAX_SAMPLES
@@ -95,18 +95,3 @@ def test_nested_samples_beyond_memory_are_refused(monkeypatch, available, most):
 def test_features_that_no_channel_shows_are_not_limited():
     """Only features that an AOV uses are compiled."""
     load(aovs="n:normal", feature_x=mi.TensorXf(np.zeros((8, 2000), np.float32)))
-
-
-def rasterized(colors, width=4, height=4):
-    one = np.zeros((1, 3), np.float32)
-    quats, camera = np.ones((1, 4), np.float32), np.eye(4, dtype=np.float32)[None]
-    return drgs.rasterization(
-        one, quats, one + 1, one[:, 0] + 0.5, colors, camera, camera[:, :3, :3], width, height
-    )
-
-
-def test_color_channels_of_rasterization_are_limited():
-    with pytest.raises(ValueError, match=r"colors must be of at most 64 channels, got 2000"):
-        rasterized(colors=np.ones((1, 2000), np.float32))
-    with pytest.raises(ValueError, match=r"width and height must be smaller: .* too many"):
-        rasterized(colors=np.ones((1, 3), np.float32), width=10**6, height=10**6)

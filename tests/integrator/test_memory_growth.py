@@ -61,19 +61,6 @@ def test_rendering_does_not_leak_memory(kind, count):
     assert growth(lambda k: dr.eval(mi.render(scene, sensor=k % 3, seed=k)), 60, count) < 4
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_deleted_scenes_free_their_memory(kind):
-    """Rendered, and differentiated, before they go."""
-
-    def use(k):
-        scene = load(kind)
-        params = mi.traverse(scene)
-        dr.enable_grad(params["integrator.means"])
-        dr.backward(dr.mean(mi.render(scene, params, sensor=k % 3), axis=None))
-
-    assert growth(use, 12, 17) < 4
-
-
 def test_optimizer_steps_do_not_leak_memory():
     scene = load("splats")
     params = mi.traverse(scene)

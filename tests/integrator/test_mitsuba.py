@@ -18,19 +18,22 @@ from support.calibrated_sensors import (
     SCALED,
     SHUTTER_SAMPLES,
     WINDOW,
+    camera_of,
+    numbers,
     own_camera,
     own_sensor,
 )
 from support.helpers import clear
+from support.kernels import kernel_hashes
 from support.openexr import read_exr
-from support.sensors import PIXELS, camera_of, numbers, points_on_rays
 from support.splats_checks import GRADIENTS, IMAGE
 from support.splats_checks import XYZ as TO_XYZ
-from support.views import Scene, View, gradient, image_of, tensors
+from support.views import VIEWS, Scene, View, gradient, image_of, pose, tensors
 from support.wall_scenes import Wall
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.io.scenes import openexr_threads
 
 VIEW = View("", 53, 41, crop=WINDOW)
@@ -102,24 +105,6 @@ def test_depth_of_a_plane_matches_rays_for_every_sensor(name):
     assert np.ptp(expected) > 0.1 and (image[..., 5] == 1).all()
     # Positions of up to 10 units in float32, seen along rays that are 30 degrees off the normal.
     np.testing.assert_allclose(image[..., 4], expected, rtol=2e-5)
-
-
-@pytest.mark.parametrize("crop", [None, WINDOW])
-@pytest.mark.parametrize(
-    ("kind", "to_world"),
-    [("thinlens", m) for m in POSES.values()]
-    + [("orthographic", m) for m in (POSES | SCALED).values()],
-    ids=[f"thinlens, {n}" for n in POSES] + [f"orthographic, {n}" for n in POSES | SCALED],
-)
-def test_points_on_rays_project_to_their_pixels(kind, to_world, crop):
-    """Rays go through the middle of the aperture."""
-    sensor = mi.load_dict(own_sensor(kind, View("", 53, 41, crop=crop, to_world=to_world)))
-    points, expected = points_on_rays(sensor)
-    c = numbers(camera_of(sensor))
-    x, y, z = c["rotation"] @ (points - c["center"]).T
-    film = np.stack([x, y], axis=-1) / (z[:, None] if kind == "thinlens" else 1)
-    assert (z > 0).all()
-    assert np.abs(film * c["focal"] + c["principal"] - expected).max() < PIXELS
 
 
 @pytest.mark.parametrize("to_world", POSES.values(), ids=POSES)
@@ -236,3 +221,38 @@ def test_dr_freeze_is_refused_without_side_effects():
             "device: call mi.render outside of the frozen function"
         )
         assert np.array_equal(image_of(loaded), expected)
+
+
+def test_a_camera_far_from_the_origin_keeps_its_centre():
+    """A translation -R c would have lost 0.06 units there, and 2 px on a film."""
+    position = (1e6, -2e6, 5e5)
+    view = View("far", to_world=pose([0.3, -1.0, 0.5], 40, position))
+    camera = numbers(camera_of(mi.load_dict(view.sensor())))
+    assert np.array_equal(camera["center"], position)
+
+
+def test_unsupported_sensors_are_refused_by_name():
+    sensor = mi.load_dict({"type": "batch", "id": "mine", "first": VIEWS[0].sensor()})
+    message = (
+        r"^splats: the sensor must be of type perspective, thinlens, orthographic or calibrated, "
+        r"got \w+ 'mine'$"
+    )
+    with pytest.raises(TypeError, match=message):
+        read_sensor(sensor, 0.01)
+
+
+def test_sensors_of_all_poses_and_sizes_share_kernels():
+    """No number of the sensor, its film or its crop window is compiled into a kernel."""
+
+    def kernels(fov=40.0, turn=30, **film):
+        pose_of_sensor = mi.ScalarTransform4f(pose([1, 2, 3], turn, (turn, 2, 3)))
+        film = {"type": "hdrfilm", **film}
+        sensor = mi.load_dict(
+            {"type": "perspective", "film": film, "fov": fov, "to_world": pose_of_sensor}
+        )
+        return kernel_hashes(lambda: dr.eval(camera_from_sensor(read_sensor(sensor, 0.01))))
+
+    first = kernels(width=33, height=21)
+    assert first and kernels(fov=50.0, turn=70, width=57, height=40) == first
+    window = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 11, "crop_height": 9}
+    assert kernels(width=33, height=21, **window) == first

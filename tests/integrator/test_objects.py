@@ -158,16 +158,11 @@ def test_files_with_different_headers_require_a_property(tmp_path):
     message = r"made for the same low_pass, got 0.1 \(.*lego.ply\), 0.3.* \(.*fox.ply\); give the"
     with pytest.raises(Exception, match=message):
         load(paths)
-    given = {
-        "type": "splats",
-        "low_pass": 0.2,
-        **{n: {"type": "splats"} | p for n, p in paths.items()},
-    }
-    assert mi.load_dict(given).state.approximations.low_pass == 0.2
+    given = {n: {"type": "splats"} | p for n, p in paths.items()} | {"low_pass": 0.2}
+    assert mi.load_dict({"type": "splats", **given}).state.approximations.low_pass == 0.2
     agreeing = mi.load_dict({"type": "splats", "a": {"type": "splats"} | paths["lego"]})
-    assert agreeing.state.approximations.low_pass == 0.1 and list(agreeing.state.header) == [
-        "low_pass"
-    ]
+    assert agreeing.state.approximations.low_pass == 0.1
+    assert list(agreeing.state.header) == ["low_pass"]
 
 
 def test_object_used_twice_receives_both_derivatives():

@@ -6,8 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.calibrated_sensors import camera_of, numbers
+from support.cases import APPROXIMATIONS
 from support.helpers import NEAR_THRESHOLD, assert_arrays_agree
-from support.sensors import camera_of, numbers, points_on_rays
 from support.viewer_rendering import VIEWER_RENDERING
 from support.views import View as Perspective
 from support.views import image_of, pose, splats_before
@@ -61,15 +62,6 @@ def test_sensor_of_a_moving_view_has_the_configured_shutter_samples(samples):
     assert sensor.shutter_samples == expected
     state = read_sensor(sensor, 0.0)
     assert len(cameras_in_time(camera_from_sensor(state))) == expected
-
-
-def test_sensor_rays_match_the_view():
-    """Independent of the integrator's reading of a sensor."""
-    view = make_view()
-    points, positions = points_on_rays(make_sensors([view])[0])
-    x, y, z = view.camera_to_world[:3, :3].T @ (points - view.center).T
-    film = np.stack([view.fx * x / z + view.cx, view.fy * y / z + view.cy], axis=-1)
-    assert np.abs(film - positions).max() < 5e-5
 
 
 def test_views_of_one_size_share_a_film():
@@ -151,19 +143,8 @@ def test_derivatives_work_between_images_of_an_unfinished_iterator():
 
 
 def test_approximations_reach_the_integrator():
-    values = {
-        "projection": "exact",
-        "falloff": "gaussian",
-        "order": "pixel",
-        "order_window": 6,
-        "sh_direction": "pixel",
-        "alpha_max": 0.95,
-        "alpha_cut": 0.0,
-        "transmittance_stop": 0.01,
-        "extent": 3.0,
-        "low_pass": 0.1,
-        "antialiased": True,
-    }
+    values = APPROXIMATIONS["all three, other cuts"] | {"falloff": "gaussian", "extent": 3.0}
+    values |= {"low_pass": 0.1, "antialiased": True}
     assert set(values) == {field.name for field in fields(Approximations)}
     scene = make_scene(bench_gaussians(5), ModelConfig(**values), (1.0, 1.0, 1.0))
     assert scene.integrator().state.approximations == Approximations(**values)

@@ -8,7 +8,7 @@ import pytest
 from conftest import CHOSEN_LLVM, REPOSITORY
 from support.helpers import clear
 from support.splats_checks import GRADIENTS, assert_images_agree, fresh_image, write_gaussians
-from support.views import VIEWS, Scene, View, gradients_of, image_of, pose, tensors, to_linear
+from support.views import VIEWS, Scene, View, gradients_of, image_of, tensors
 
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.gaussians.parameters import PARAMETER_NAMES
@@ -193,14 +193,6 @@ def test_crop_window_is_a_part_of_the_whole_image(crop):
         image_of(whole.load_with(view.sensor(), **values)) for view in (whole.view, window)
     )
     assert_images_agree(window_image, whole_image[window.window])
-
-
-def test_background_shows_where_there_are_no_splats():
-    elsewhere = View("elsewhere", to_world=pose([1, 0, 0], -90, (0, 1000, 0))).sensor()
-    scene = Scene(srgb_primitives=True)
-    image = image_of(scene.load(), sensor=mi.load_dict(elsewhere))
-    assert np.allclose(image[..., :3], to_linear(scene.background), rtol=1e-5)
-    assert (image[..., 3] == 0).all()
 
 
 def test_every_way_to_call_gives_the_same_image():

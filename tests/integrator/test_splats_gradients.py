@@ -17,12 +17,9 @@ from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
 SETTINGS = {
-    "degree 1": Scene(),
-    "degree 3": Scene(degree=3),
     "degree 0": Scene(degree=0),
     "degree 1 of 3": Scene(degree=3, sh_degree=1),
     "degree 0 of 2": Scene(degree=2, sh_degree=0),
-    "antialiased": Scene(antialiased=True),
     "near": Scene(near=0.25),
     "near clip of the sensor": Scene(replace(VIEWS[1], near_clip=0.25)),
     "crop window": Scene(VIEWS[12]),

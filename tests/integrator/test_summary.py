@@ -22,15 +22,13 @@ from drgs.fit.summary import summary_of_fit
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import format_effects, summary_of_sensors, summary_of_views
 
-MODULES = (
-    "cameras.distortion", "cameras.fisheye", "cameras.motion", "cameras.orthographic",
-    "cameras.radial_tangential",
-    "cameras.thin_prism_fisheye", "effects.defocus", "effects.occlusion",
-    "effects.smoothing", "gaussians.rotation", "gaussians.similarity", "integrator.parts",
-    "integrator.light.splat_transport", "integrator.light.shadows",
-    "integrator.light.surfaces",
-    "light", "light.grid", "light.probe", "light.walk",
-)  # fmt: skip
+MODULES = """
+    accuracy.exact accuracy.pixel_lists accuracy.pixel_order accuracy.ray_colors accuracy.unscented
+    cameras.distortion cameras.fisheye cameras.motion cameras.orthographic cameras.radial_tangential
+    cameras.thin_prism_fisheye effects.defocus effects.occlusion effects.smoothing
+    gaussians.rotation gaussians.similarity integrator.parts integrator.light.splat_transport
+    integrator.light.shadows integrator.light.surfaces light light.grid light.probe light.walk
+"""
 """Modules used only by effects of images; a fit asks every effect whether it takes part."""
 
 
@@ -234,77 +232,60 @@ mi.set_variant("llvm_ad_rgb")
 from support import small_capture as capture
 from support.trainers import make_trainer
 
-make_trainer().step()
-now = set(sys.modules) & set({modules!r})
-found = {{"a plain fit": sorted(now - set({asked!r}))}}
-known = now | set({asked!r})
-
-def sensor(**settings):
+def show(objects=(), kind="perspective", sensor=(), **settings):
     film = {{"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {{"type": "box"}}}}
-    return {{"film": film, **settings}}
-
-capture.blobs().save({ply!r})
-aperture = {{"aperture_radius": 0.1, "focus_distance": 2.0}}
-plain, ball = {{"sensor": sensor(type="perspective")}}, {{"ball": {{"type": "sphere"}}}}
-lit = {{"sky": {{"type": "constant"}}, **ball}}
-for name, scene, settings in (
-    ("calibrated", {{"sensor": sensor(type="calibrated")}}, {{}}),
-    ("perspective", plain, {{"light": "none"}}),
-    ("light without surfaces", plain, {{"light": "rays"}}),
-    ("environment", plain | {{"sky": {{"type": "constant"}}}}, {{}}),
-    ("distorted", {{"sensor": sensor(type="calibrated", lens="opencv", k1=0.1)}}, {{}}),
-    ("thin lens", {{"sensor": sensor(type="thinlens", **aperture)}}, {{}}),
-    ("orthographic", {{"sensor": sensor(type="orthographic")}}, {{}}),
-    ("surface", plain | lit, {{"light": "none"}}),
-    ("path", plain | lit, {{"nested": {{"type": "path"}}}}),
-    ("splatpath", plain | lit, {{"nested": {{"type": "splatpath"}}}}),
-    ("light", plain | lit, {{"light": "rays"}}),
-    ("shadows", plain | lit, {{"shadows": "ball"}}),
-    ("object in its place", plain, {{"to_world": mi.ScalarTransform4f().scale(2)}}),
-):
+    sensor = {{"type": kind, "film": film, **dict(sensor)}}
     integrator = {{"type": "splats", "filename": {ply!r}, **settings}}
-    mi.render(mi.load_dict({{"type": "scene", "integrator": integrator, **scene}}), spp=1)
+    scene = {{"type": "scene", "integrator": integrator, "sensor": sensor, **dict(objects)}}
+    mi.render(mi.load_dict(scene), spp=1)
+
+aperture = {{"aperture_radius": 0.1, "focus_distance": 2.0}}
+sky = {{"sky": {{"type": "constant"}}}}
+lit = {{**sky, "ball": {{"type": "sphere"}}}}
+capture.blobs().save({ply!r})
+found, known = [], set()
+for step in {steps!r}:
+    eval(step)
     now = set(sys.modules) & set({modules!r})
-    found[name] = sorted(now - known)
+    found.append(sorted(now - known))
     known |= now
 print(json.dumps(found))
 """
 
+STEPS = {
+    "make_trainer().step()": "cameras.motion effects.smoothing",
+    "show(kind='calibrated')": "",
+    "show(light='none')": "",
+    "show(light='rays')": "",  # without surfaces
+    "show(sky)": "",
+    "show(projection='exact')": "accuracy.exact",
+    "show(projection='unscented')": "accuracy.unscented",
+    "show(order='pixel')": "accuracy.pixel_lists accuracy.pixel_order",
+    "show(sh_direction='pixel')": "accuracy.ray_colors",
+    "show(kind='calibrated', sensor={'lens': 'opencv', 'k1': 0.1})": (
+        "cameras.distortion cameras.radial_tangential"
+    ),
+    "show(kind='thinlens', sensor=aperture)": "effects.defocus",
+    "show(kind='orthographic')": "cameras.orthographic",
+    "show(lit, light='none')": "effects.occlusion integrator.light.surfaces",
+    "show(lit, nested={'type': 'path'})": "",
+    "show(lit, nested={'type': 'splatpath'})": "",
+    "show(lit, light='rays')": (
+        "integrator.light.splat_transport light light.grid light.probe light.walk"
+    ),
+    "show(lit, shadows='ball')": "integrator.light.shadows",
+    "show(to_world=mi.ScalarTransform4f().scale(2))": (
+        "gaussians.rotation gaussians.similarity integrator.parts"
+    ),
+}
+"""Expressions, and the modules that each imports besides those of the expressions before."""
+
 
 @pytest.mark.slow
 def test_each_effect_imports_its_own_modules(run_python, tmp_path):
-    """In this order, what comes later knows what came before."""
-    program = IMPORTS.format(
-        tests=TESTS,
-        modules=[f"drgs.{name}" for name in MODULES],
-        asked=["drgs.effects.smoothing", "drgs.cameras.motion"],  # by a fit
-        ply=str(tmp_path / "blobs.ply"),
-    )
-    result = run_python(program)
+    modules, steps = [f"drgs.{name}" for name in MODULES.split()], [*STEPS]
+    ply = str(tmp_path / "blobs.ply")
+    result = run_python(IMPORTS.format(tests=TESTS, modules=modules, ply=ply, steps=steps))
     assert result.returncode == 0, result.stderr
-    assert json.loads(result.stdout) == {
-        "a plain fit": [],
-        "calibrated": [],
-        "perspective": [],
-        "light without surfaces": [],
-        "environment": [],
-        "distorted": ["drgs.cameras.distortion", "drgs.cameras.radial_tangential"],
-        "thin lens": ["drgs.effects.defocus"],
-        "orthographic": ["drgs.cameras.orthographic"],
-        "surface": ["drgs.effects.occlusion", "drgs.integrator.light.surfaces"],
-        "path": [],
-        "splatpath": [],
-        "light": [
-            "drgs.integrator.light.splat_transport",
-            "drgs.light",
-            "drgs.light.grid",
-            "drgs.light.probe",
-            "drgs.light.walk",
-        ],
-        "shadows": ["drgs.integrator.light.shadows"],
-        "object in its place": [
-            "drgs.gaussians.rotation",
-            "drgs.gaussians.similarity",
-            "drgs.integrator.parts",
-        ],
-    }
+    found = dict(zip(steps, json.loads(result.stdout), strict=True))
+    assert found == {k: [f"drgs.{name}" for name in v.split()] for k, v in STEPS.items()}

@@ -1,11 +1,9 @@
 """PLY files: ours, which are the reference's, those of others, damaged and hostile ones; and the
 settings that a header records."""
 
-import os
 import resource
 from dataclasses import replace
 from itertools import product
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from plyfile import PlyData, PlyElement
 from support.formats import gaussians_within_ranges, refusal
 
 from drgs.config.approximations import from_ply_header
-from drgs.core.errors import UserError, UserNote
+from drgs.core.errors import UserNote
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.ply import read_points
 
@@ -122,16 +120,6 @@ def test_infinite_logits_become_opacities_distinct_from_0_and_1(tmp_path):
     np.testing.assert_array_equal(logits[[0, 4]], np.float32([0.5, 1e30]))  # as they are
     assert 1 - 2.0**-22 < loaded.opacities[1] < 1
     assert np.finfo(np.float32).tiny <= loaded.opacities[2] < 1e-37
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "a.ply"
-    gaussians_within_ranges(1).save(path)
-    before = path.read_bytes()
-    monkeypatch.setattr(os, "replace", Mock(side_effect=OSError("disk full")))
-    with pytest.raises(UserError, match=r"a.ply: cannot write the file: disk full"):
-        gaussians_within_ranges(2).save(path)
-    assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize(

@@ -135,10 +135,7 @@ def image_of(width, height):
 
 
 REFUSED = {
-    "version": (
-        with_meta(lambda m: m.pop("version")),
-        "meta.json: version is missing",
-    ),
+    "version": (with_meta(lambda m: m.pop("version")), "meta.json: version is missing"),
     "later version": (
         with_meta(lambda m: m.update(version=3)),
         "meta.json: version must be one of 2, got 3",

@@ -216,7 +216,7 @@ PROJECTIONS = [
 @pytest.mark.parametrize("model", PROJECTIONS, ids=lambda model: model.projection)
 def test_regions_of_any_tiling_are_crops_of_the_whole(model, monkeypatch):
     gaussians, camera = small_scene()
-    positions = rays.pixel_centers(camera) + 0.2
+    positions = reference.pixel_centers(camera.width, camera.height) + 0.2
     whole = rays.render(gaussians, camera, BACKGROUND, model, positions=positions)
     monkeypatch.setattr(rays, "MAX_PAIRS", 7)
     for region in (np.s_[:, :], np.s_[3:17, 5:9], np.s_[:, -4:], np.s_[7:8, 0:1], np.s_[5:5, :]):
@@ -232,7 +232,7 @@ def test_shifted_positions_are_a_shifted_principal_point(model):
     gaussians, camera = small_scene()
     gaussians = only(gaussians, np.arange(9))  # splat 9's slope is clamped, relative to the film
     shift = np.array([0.3, -5.7])
-    positions = rays.pixel_centers(camera) + shift
+    positions = reference.pixel_centers(camera.width, camera.height) + shift
     moved = replace(camera, cx=camera.cx - shift[0], cy=camera.cy - shift[1])
     shifted = rays.render(gaussians, camera, BACKGROUND, model, positions=positions)
     expected = rays.render(gaussians, moved, BACKGROUND, model)

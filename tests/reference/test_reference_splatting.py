@@ -56,17 +56,16 @@ def test_gradients_equal_central_differences(antialiased, sh_degree):
 def composite(opacities, depths, offset=0.0, colors=None) -> reference.RenderedImage:
     """Splats of 1 px^2, stacked on the middle pixel of a 9 x 9 film; white by default."""
     n = len(opacities)
-    return reference.composite(
+    splats = reference.Projection(
         means2d=np.tile([4.5 - offset, 4.5], (n, 1)),
+        cov2d=np.tile(np.eye(2), (n, 1, 1)),
         conics=np.tile(np.eye(2), (n, 1, 1)),
+        depths=np.array(depths),
         opacities=np.array(opacities),
-        colors=np.ones((n, 3)) if colors is None else colors,
-        depths=depths,
         visible=np.ones(n, dtype=bool),
-        background=np.zeros(3),
-        width=9,
-        height=9,
     )
+    colors = np.ones((n, 3)) if colors is None else colors
+    return reference.composite(splats, colors, np.zeros(3), 9, 9)
 
 
 def test_a_hundred_ties_are_composited_by_index():

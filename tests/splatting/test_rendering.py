@@ -1,6 +1,6 @@
-"""Features, attached parameters, visibility and weights of whole images."""
+"""Features, gradients and weights of whole images."""
 
-from functools import cache
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
@@ -19,7 +19,6 @@ from support.helpers import (
     plane_cotangents,
     reference_gradients,
     render,
-    rows,
 )
 
 from drgs.accuracy.pipeline import pipeline_of
@@ -27,7 +26,6 @@ from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
-from drgs.splatting.projection import plain_opacity
 
 # Relative to the largest value of each array.
 #
@@ -43,25 +41,25 @@ GRADIENTS = {FLOAT64: 1e-12, FLOAT32: 5e-5}
 CASE = Case("degree 3", 37, 29, 3)
 
 
-@cache
-def expected_gradients(case) -> dict[str, np.ndarray]:
-    return reference_gradients(case, Cotangents.random(case))
-
-
 @both_precisions
 @pytest.mark.parametrize(
-    "features",
+    ("features", "order"),
     [
-        (rendering.color_features,),
-        (rendering.depth_feature,),
-        (rendering.depth_feature, rendering.color_features, rendering.depth_feature),
+        ((rendering.color_features,), "center"),
+        ((rendering.depth_feature,), "center"),
+        (
+            (rendering.depth_feature, rendering.color_features, rendering.depth_feature),
+            "center",
+        ),
+        *(((), order) for order in ("center", "pixel")),  # what an alpha mask needs
     ],
-    ids=["color", "depth", "depth color depth"],
+    ids=["color", "depth", "depth color depth", "nothing", "nothing, pixel order"],
 )
-def test_features_are_composited_in_the_given_order(precision, features):
+def test_features_are_composited_in_the_given_order(precision, features, order):
     """Planes and gradients are those of colour and depth, whose law the matrix checks."""
-    gaussians, frame = render(CASE, precision, rendering.Pipeline(3, plain_opacity, features))
-    _, usual = render(CASE, precision)
+    usual = pipeline_of(Approximations(order=order), 3, CASE.pipeline.features)
+    gaussians, frame = render(CASE, precision, replace(usual, features=features))
+    _, usual = render(CASE, precision, usual)
     channels = [
         channel
         for feature in features
@@ -86,7 +84,7 @@ def test_features_are_composited_in_the_given_order(precision, features):
     assert_arrays_agree(
         {name: np.array(getattr(actual, name)) for name in PARAMETER_NAMES},
         {name: np.array(getattr(wanted, name)) for name in PARAMETER_NAMES},
-        GRADIENTS[precision],
+        GRADIENTS[precision] if features else 0,
     )
 
 
@@ -101,28 +99,13 @@ def test_attached_parameters_are_detached(precision):
         frame = rendering.render(gaussians, camera, case.pipeline)
         cotangents = plane_cotangents(case, Cotangents.random(case), precision)
         gradients = frame_adjoint(gaussians, frame, *cotangents)
+    expected = reference_gradients(case, Cotangents.random(case))
     assert_arrays_agree(
         {name: np.array(getattr(gradients.parameters, name)) for name in PARAMETER_NAMES},
-        {name: expected_gradients(case)[name] for name in PARAMETER_NAMES},
+        {name: expected[name] for name in PARAMETER_NAMES},
         GRADIENTS[precision],
     )
     assert not any(np.array(dr.grad(getattr(gaussians, name))).any() for name in PARAMETER_NAMES)
-
-
-@both_precisions
-def test_splats_overlapping_the_film_are_visible(precision):
-    case = clear(CASE)
-    gaussians, frame = render(case, precision)
-    gradients = frame_adjoint(
-        gaussians, frame, *plane_cotangents(case, Cotangents.random(case), precision)
-    )
-    visible = np.array(gradients.visible)
-    assert 0 < visible.sum() < len(visible)
-    in_front = reference.project(*case.scene).visible
-    assert not (visible & ~in_front).any() and (in_front & ~visible).any()
-    touched = expected_gradients(case)["means2d"].any(axis=1)
-    assert visible[touched].all()
-    assert not rows(gradients.means2d)[~visible].any()
 
 
 @pytest.mark.parametrize("sh_direction", ["mean", "pixel"])
@@ -138,11 +121,8 @@ def test_weighted_sums_are_image_contributions_times_the_plane(precision, sh_dir
     plane = np.random.default_rng(3).uniform(0, 1, (case.height, case.width))
     expected = []
     for white in np.eye(12):
-        rendered = reference.composite(
-            splats.means2d, splats.conics, splats.opacities, np.repeat(white[:, None], 3, axis=1),
-            splats.depths, splats.visible, np.zeros(3), case.width, case.height,
-            cuts=splats.cuts,
-        )  # fmt: skip
+        colors = np.repeat(white[:, None], 3, axis=1)
+        rendered = reference.composite(splats, colors, np.zeros(3), case.width, case.height)
         expected.append(np.sum(rendered.image[..., 0] * plane))
     approximations = Approximations(sh_direction=sh_direction)
     pipeline = pipeline_of(approximations, case.rendered_degree)

@@ -1,32 +1,22 @@
 """The whole chain against gsplat's images and gradients."""
 
-from dataclasses import replace
-
-import drjit as dr
 import numpy as np
 import pytest
 from support.helpers import (
     NEAR_THRESHOLD,
-    Case,
     both_precisions,
-    clear,
     device_camera,
     device_gaussians,
     frame_adjoint,
     rows,
 )
 
-from drgs.accuracy.pipeline import pipeline_of
-from drgs.config.approximations import Approximations
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 
 
 def gsplat_frame(scene, precision):
-    gaussians, camera = (
-        device_gaussians(scene[0], precision),
-        device_camera(scene[1], precision),
-    )
+    gaussians, camera = (device_gaussians(scene[0], precision), device_camera(scene[1], precision))
     frame = rendering.render(gaussians, camera, rendering.Pipeline(3))
     height, width = scene[1].height, scene[1].width
     planes = np.stack([rows(plane).reshape(height, width) for plane in frame.planes()], axis=-1)
@@ -75,27 +65,3 @@ def test_gradients_agree_with_gsplat(precision, gsplat):
         assert cosine >= 0.9999, name
         # Nearly all of it in the Gaussians of the flipped pixels. Measured at most 5e-4.
         assert np.linalg.norm(ours - theirs) <= 1e-3 * np.linalg.norm(theirs), name
-
-
-@both_precisions
-@pytest.mark.parametrize("order", ["center", "pixel"])
-def test_transmittance_alone_is_rendered_and_differentiated(precision, order):
-    """A pipeline without features: what an alpha mask needs."""
-    pipeline = pipeline_of(Approximations(order=order), 1)
-    case = clear(Case("alpha only", 21, 18, 1))
-    gaussians = device_gaussians(case.gaussians, precision)
-    camera = device_camera(case.camera, precision)
-    rng = np.random.default_rng(5)
-    cotangent = precision.Float(rng.normal(size=21 * 18))
-    with_color = rendering.render(gaussians, camera, pipeline)
-    alone = rendering.render(gaussians, camera, replace(pipeline, features=()))
-    assert len(alone.planes()) == 1
-    assert dr.all(alone.planes()[0] == with_color.planes()[0])
-    zero = dr.zeros(precision.Float, 21 * 18)
-    expected = frame_adjoint(gaussians, with_color, [zero] * 3, cotangent)
-    got = frame_adjoint(gaussians, alone, [], cotangent)
-    for name in ("means", "quats", "log_scales"):
-        expected_array = np.array(getattr(expected.parameters, name))
-        got_array = np.array(getattr(got.parameters, name))
-        # The same sums with zeros added: equal but for the sign of zero.
-        assert np.array_equal(got_array, expected_array), name

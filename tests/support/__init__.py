@@ -1,1 +1,1 @@
-"""Code that tests share: scenes, small fits and captures, conditioning, mutants."""
+"""Code that tests share: scenes, small fits and captures, mutants."""

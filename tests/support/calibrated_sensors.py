@@ -7,12 +7,13 @@ from dataclasses import asdict, dataclass, replace
 import mitsuba as mi
 import numpy as np
 
+from drgs.cameras.camera import Camera
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.reference import effects
 from drgs.reference import splatting as reference
 from drgs.reference.effects import Equirectangular, Fisheye, OpenCV, Pinhole, ThinPrismFisheye
 from support.helpers import NEAR_THRESHOLD
-from support.lens_scenes import LENSES
-from support.rolling_shutter import rolling_image
+from support.lens_scenes import LENSES, rolling_image
 from support.views import VIEWS, Scene, View, pose, splats_before
 
 WINDOW = (13, 7, 29, 18)
@@ -168,3 +169,18 @@ def own_camera(view) -> reference.Camera:
         view.camera, rotation=rotation, fx=fx, fy=fy, cx=view.width / 2, cy=view.height / 2,
         near=0.01,
     )  # fmt: skip
+
+
+# px. A float32 direction is good to 1e-7, which over a focal length of 50 px is 5e-6 px; the ray's
+# origin adds as much at a distance of 1. Measured 8e-6.
+PIXELS = 5e-5
+
+
+def camera_of(sensor, near=0.01) -> Camera:
+    return camera_from_sensor(read_sensor(sensor, near))
+
+
+def numbers(camera) -> dict[str, np.ndarray]:
+    """Return the numbers of a Dr.Jit camera in float64."""
+    names = ("rotation", "center", "focal", "principal", "near")
+    return {n: np.array(getattr(camera, n)).astype(np.float64)[..., 0] for n in names}

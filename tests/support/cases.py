@@ -24,10 +24,9 @@ from support.lens_scenes import (
     gaussians_at_points,
     kernel_lens,
     point_beyond_lens_limit,
+    rolling_image,
     seen_points,
 )
-from support.rolling_shutter import rolling_image
-from support.smoothing import smoothed_reference
 
 MOTION_SAMPLES = 3
 PINHOLE = effects.Pinhole()
@@ -74,6 +73,20 @@ def by_effects(case, values, lens=PINHOLE):
             defocus, case.degree, NEAR_THRESHOLD,
         )
     )  # fmt: skip
+
+
+def rates_of(smoothing) -> np.ndarray:
+    """The sampling rates that call for a filter: its variance is 0.2 / rate^2."""
+    return np.sqrt(0.2) / smoothing
+
+
+def smoothed_reference(gaussians: reference.Gaussians, smoothing) -> reference.Gaussians:
+    """Gaussians whose parameters hold the filter."""
+    scales, opacities = effects.smoothing_filter(
+        gaussians.log_scales, gaussians.logit_opacities, rates_of(smoothing)
+    )
+    logits = np.log(opacities) - np.log1p(-opacities)
+    return replace(gaussians, log_scales=np.log(scales), logit_opacities=logits)
 
 
 TRAVEL, TURN = np.array([0.125, -0.0625, 0.03125]), np.array([0.03125, 0.0625, -0.09375])

@@ -312,11 +312,7 @@ def frame_tangent(gaussians, frame, tangents) -> list:
 def as_images(planes, camera) -> dict[str, np.ndarray]:
     """Planes (transmittance, color, depth) as transmittance (H, W), color (H, W, 3), depth."""
     planes = [rows(plane).reshape(camera.height, camera.width) for plane in planes]
-    return {
-        "transmittance": planes[0],
-        "color": np.stack(planes[1:4], axis=-1),
-        "depth": planes[4],
-    }
+    return {"transmittance": planes[0], "color": np.stack(planes[1:4], axis=-1), "depth": planes[4]}
 
 
 def image_planes(frame, case=None) -> dict[str, np.ndarray]:

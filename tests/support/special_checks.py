@@ -20,14 +20,7 @@ from drgs.splatting.footprint import Alpha
 from drgs.splatting.rasterize import composite_step
 from drgs.testing import Case, single
 from support.cases import CASES, close, reference_camera, thresholds
-from support.helpers import (
-    FLOAT32,
-    FLOAT64,
-    device_camera,
-    device_gaussians,
-    frame_adjoint,
-    rows,
-)
+from support.helpers import FLOAT32, FLOAT64, device_camera, device_gaussians, frame_adjoint, rows
 
 MIXED = next(case for case in CASES if case.name == "default, mixed")
 
@@ -119,10 +112,7 @@ def check_a_splat_without_opacity_has_no_derivatives():
     """An opacity that underflows to zero has the logarithm - inf."""
     zero = FLOAT64.Float(0)
     rays = [FLOAT64.Float(x) for x in (0.5, 0.5, 1, 0, 1, -math.inf, -1, 0, 0.5)]
-    for falloff, geometry in (
-        (exact.RayFalloff(), rays),
-        (footprint.GaussianFalloff(), rays[:6]),
-    ):
+    for falloff, geometry in ((exact.RayFalloff(), rays), (footprint.GaussianFalloff(), rays[:6])):
         derivatives = falloff.derivatives(geometry, [zero] * falloff.num_moments)
         assert [float(d[0]) for d in derivatives] == [0] * len(geometry)
 

@@ -293,7 +293,7 @@ class Scene:
         d_background = np.einsum("hw,hwc->c", transmittance, d_image)
         d_alpha = d_alpha - d_image @ background
         gradients = reference.render_gradients(
-            gaussians or self.gaussians, self.camera, np.zeros(3), d_image, d_alpha, None,
+            gaussians or self.gaussians, self.camera, np.zeros(3), d_image, d_alpha, 0.0,
             self.rendered_degree, self.antialiased,
         )  # fmt: skip
         return gradients | {"background": d_background}

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from support import small_fits as fits
+from support.cases import smoothed_reference
 from support.fit_command import assert_fits, without_images, write_scene
 from support.small_capture import reference_camera
-from support.smoothing import smoothed_reference
 from support.viewer_rendering import VIEWER_RENDERING
 
 import drgs  # noqa: F401  (registers the plugin)

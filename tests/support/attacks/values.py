@@ -30,10 +30,7 @@ VALUES = (
 )
 """In YAML."""
 
-LONG_WORK = {
-    "data.shutter_samples": ("1_000",),
-    "iterations": ("10000.0", "2147483647", "1_000"),
-}
+LONG_WORK = {"data.shutter_samples": ("1_000",), "iterations": ("10000.0", "2147483647", "1_000")}
 """Valid values that mean endless work, by key."""
 
 ENABLING_SETTINGS = {

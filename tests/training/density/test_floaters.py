@@ -54,9 +54,8 @@ def weights_in(view, gaussians):
     intrinsics = view.fx, view.fy, view.cx, view.cy, view.width, view.height
     camera = reference.Camera(rotation, view.center, *intrinsics, NEAR)
     splats = reference.project(gaussians, camera)
-    inputs = [splats.means2d, splats.conics, splats.opacities, np.ones((len(splats.depths), 3))]
-    inputs += [splats.depths, splats.visible, np.zeros(3), SIDE, SIDE]
-    image = reference.composite(*inputs)
+    inputs = splats, np.ones((len(splats.depths), 3)), np.zeros(3)
+    image = reference.composite(*inputs, SIDE, SIDE)
     shown = image.alpha > 0.01
     inverse = np.where(shown, image.alpha / np.where(shown, image.depth, 1), 0)
     planes = np.stack([shown, inverse, 0 * inverse], axis=-1)
