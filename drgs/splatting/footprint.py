@@ -163,7 +163,8 @@ class PixelCenters(SamplePositions):
     @override
     def sum_dx(self, values: list[Float], dx: list[Float]) -> Float:
         """Sum values times dx: a column shares dx, so columns are summed first."""
-        return dot([total(values[i::MICRO]) for i in range(MICRO)], dx[:MICRO])
+        columns = [total(values[i::MICRO]) for i in range(MICRO)]
+        return dot(columns, dx[:MICRO])
 
     @override
     def sum_dy(self, values: list[Float], dy: list[Float]) -> Float:

@@ -192,8 +192,9 @@ def frames_adjoint(
     Not differentiated: visibility, the order of the splats, the decisions of compositing.
     """
     of_splats, first = splats_adjoint(frames, d_planes), frames[0]
-    given = CameraGradients(first.camera, first.pipeline, of_splats)
-    total, by_row = gradients_by_row(gaussians, given, with_camera)
+    total, by_row = gradients_by_row(
+        gaussians, CameraGradients(first.camera, first.pipeline, of_splats), with_camera
+    )
     # dr.sum adds in the same order in every run.
     camera = [dr.sum(each) for each in by_row] if with_camera else None
     return replace(total, visible=on_film(first.tiles.bins), camera=camera)
