@@ -20,9 +20,15 @@ import numpy as np
 
 from drgs.accuracy.error_budget import Search
 from drgs.accuracy.pipeline import pipeline_of
-from drgs.bench.output import add_out, machine, markdown_table, write_rows
+from drgs.bench.output import (
+    add_out,
+    count_operations,
+    machine,
+    markdown_table,
+    time_in_turns,
+    write_rows,
+)
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
-from drgs.bench.timing import count_operations, time_in_turns
 from drgs.cameras.camera import Camera
 from drgs.cli.commands import CommandParser
 from drgs.config.approximations import Approximations

@@ -5,8 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from drgs.cameras.axes import OPENCV_TO_OPENGL
 from drgs.cameras.camera import Camera
+from drgs.cameras.viewpoints import OPENCV_TO_OPENGL
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import film_description
 from drgs.reference import splatting as reference

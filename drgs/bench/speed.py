@@ -17,9 +17,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.bench.output import add_out, machine, markdown_table, write_rows
+from drgs.bench.output import add_out, machine, markdown_table, time_in_turns, write_rows
 from drgs.bench.scenes import bench_camera, bench_gaussians, mitsuba_sensor
-from drgs.bench.timing import time_in_turns
 from drgs.cli.commands import CommandParser
 from drgs.config.schema import ModelConfig
 from drgs.core.private import disable_avx512

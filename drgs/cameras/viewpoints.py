@@ -17,6 +17,13 @@ from drgs.core.errors import UserError
 if TYPE_CHECKING:
     from drgs.cameras.lens import Lens
 
+OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+OPENCV_TO_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
+OPENGL_TO_MITSUBA = OPENCV_TO_OPENGL @ OPENCV_TO_MITSUBA
+"""Axes of cameras: OpenCV's (x right, y down, z forward), which drgs uses, OpenGL's of datasets (x
+right, y up, z backward), and Mitsuba's (x left, y up, z forward). A matrix stands on the right of a
+pose (camera to world) and is its own inverse."""
+
 PARALLEL_AXES = 1e-3
 """Smallest eigenvalue of mean(I - d d^T), d the optical axes: about the mean squared sine of
 their angle to a common direction. Below this (1.8 degrees) their nearest point is noise."""
@@ -193,3 +200,10 @@ def _no_focus(cameras: str) -> UserError:
         f"init.half_extent: no start box can be derived from {cameras}; set init.half_extent, or "
         "give a point cloud (init.point_cloud)"
     )
+
+
+def between_opencv_and_opengl(pose: np.ndarray) -> np.ndarray:
+    """Return a pose (4, 4), camera to world, in the other of the two conventions, float64."""
+    turned = np.array(pose, np.float64)
+    turned[:3, 1:3] *= -1
+    return turned

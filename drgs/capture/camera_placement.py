@@ -16,8 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drgs.cameras.axes import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA
-from drgs.cameras.viewpoints import look_at
+from drgs.cameras.viewpoints import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA, look_at
 from drgs.capture.path_tracing import (
     MIN_LIT_PART,
     SPLITS,

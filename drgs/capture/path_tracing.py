@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.cameras.axes import OPENGL_TO_MITSUBA
+from drgs.cameras.viewpoints import OPENGL_TO_MITSUBA
 from drgs.core.errors import UserError, one_line, reason_of_mitsuba
 from drgs.core.types import Bool
 from drgs.integrator.scene import film_description

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.cameras.axes import between_opencv_and_opengl
-from drgs.cameras.viewpoints import Viewpoint, panorama_intrinsics
+from drgs.cameras.viewpoints import Viewpoint, between_opencv_and_opengl, panorama_intrinsics
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.errors import UserError, note_user
 from drgs.core.origin import WORLD, Origin

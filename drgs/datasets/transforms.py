@@ -21,9 +21,8 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetPydanticSchema, Strict
 from pydantic_core.core_schema import no_info_after_validator_function
 
-from drgs.cameras.axes import between_opencv_and_opengl
 from drgs.cameras.lens import LENSES, Lens
-from drgs.cameras.viewpoints import MAX_COORDINATE, CameraMotion
+from drgs.cameras.viewpoints import MAX_COORDINATE, CameraMotion, between_opencv_and_opengl
 from drgs.config.schema import DataConfig
 from drgs.config.section import parse_json, validate
 from drgs.core.errors import UserError, format_names, one_line

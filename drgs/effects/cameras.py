@@ -18,8 +18,8 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.cameras.motion import rotation_matrix
+from drgs.cameras.viewpoints import OPENCV_TO_MITSUBA
 from drgs.config.extensions import EFFECTS
 from drgs.config.section import Count, Section
 from drgs.core.errors import UserError

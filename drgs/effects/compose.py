@@ -11,8 +11,7 @@ from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Pinhole
 from drgs.core.arrays import types_of
 from drgs.core.types import Float
-from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.gaussians.parameters import Gaussians, quat_to_rotation
 from drgs.splatting.projection import GaussianRows, Splats2D
 from drgs.splatting.rendering import Pipeline
 

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 import drjit as dr
 import numpy as np
+from drjit.auto.ad import Array3f, Array4f, Matrix3f
 
-from drgs.core.arrays import from_host
+from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError, note_user
 from drgs.core.files import atomic_path
 from drgs.core.origin import WORLD, Origin, format_origin
@@ -239,3 +240,31 @@ def _exp(x: Tensor) -> Tensor:
         return dr.exp(x)
     with np.errstate(over="ignore"):  # infinite: an opacity of 0, a scale beyond all numbers
         return np.exp(x)
+
+
+def quat_to_rotation(quats: Array4f) -> Matrix3f:
+    """Return the rotation matrix of ``quats`` (wxyz, any norm).
+
+    The quaternion is first divided by its largest component, so that norms of 1e-20 and 1e20
+    neither underflow nor overflow. A zero quaternion is the identity, with zero gradient.
+    """
+    t = types_of(type(quats.x))
+    size = dr.detach(dr.max(dr.abs(quats)))
+    usable = ~(size <= 0)  # a NaN goes through: projection then drops the Gaussian
+    q = dr.select(usable, quats, t.Array4f(1, 0, 0, 0)) / dr.select(usable, size, 1)
+    w, x, y, z = q
+    two = 2 / dr.squared_norm(q)
+    return t.Matrix3f(
+        [
+            [1 - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)],
+            [two * (x * y + w * z), 1 - two * (x * x + z * z), two * (y * z - w * x)],
+            [two * (x * z - w * y), two * (y * z + w * x), 1 - two * (x * x + y * y)],
+        ]
+    )
+
+
+def normalize(vector: Array3f) -> Array3f:
+    """Return the unit vector; a zero vector stays zero, with zero gradient."""
+    squared_norm = dr.squared_norm(vector)
+    usable = squared_norm > 0
+    return vector * dr.select(usable, dr.rsqrt(dr.select(usable, squared_norm, 1)), 0)

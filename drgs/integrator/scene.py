@@ -11,8 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.cameras.axes import OPENCV_TO_MITSUBA
-from drgs.cameras.viewpoints import Viewpoint
+from drgs.cameras.viewpoints import OPENCV_TO_MITSUBA, Viewpoint
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 from drgs.core.memory import too_large_reason

@@ -26,7 +26,7 @@ import drjit as dr
 from drgs.core.arrays import ArrayTypes, Rows, types_of
 from drgs.core.constants import COLOR_MIN
 from drgs.core.types import Array3f, Bool, Float, Scalar, UInt32
-from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.gaussians.parameters import quat_to_rotation
 from drgs.gaussians.sh import num_coefficients, sh_basis
 from drgs.light.grid import Ellipsoids, SplatGrid, build_grid
 from drgs.splatting.footprint import Cutoffs

@@ -17,9 +17,8 @@ import mitsuba as mi
 import numpy as np
 from matplotlib import colormaps
 
-from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.cameras.lens import LENSES
-from drgs.cameras.viewpoints import Viewpoint, pinhole
+from drgs.cameras.viewpoints import OPENCV_TO_MITSUBA, Viewpoint, pinhole
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.config.schema import ModelConfig
 from drgs.gaussians.parameters import Gaussians

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drgs.cameras.axes import between_opencv_and_opengl
-from drgs.cameras.viewpoints import Viewpoint
+from drgs.cameras.viewpoints import Viewpoint, between_opencv_and_opengl
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import read_text, write_json
 from drgs.core.origin import Origin

@@ -23,8 +23,7 @@ from drgs.core.arrays import load_columns, types_of
 from drgs.core.constants import ALPHA_CUT, LOW_PASS, MIN_LOW_PASS_PX2, NEGLIGIBLE_ALPHA
 from drgs.core.types import Array2f, Array3f, Array4f, Bool, Float, TensorXf
 from drgs.gaussians import sh
-from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.quaternions import normalize, quat_to_rotation
+from drgs.gaussians.parameters import Gaussians, normalize, quat_to_rotation
 
 
 @dataclass(frozen=True)

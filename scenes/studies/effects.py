@@ -18,14 +18,13 @@ import drgs  # noqa: F401  (registers the plugins)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from drgs.bench.output import columns_table, machine, write_rows
+from drgs.bench.output import columns_table, count_operations, machine, seconds, write_rows
 from drgs.bench.scenes import (
     bench_camera,
     bench_gaussians,
     mitsuba_pose,
     mitsuba_sensor,
 )
-from drgs.bench.timing import count_operations, seconds
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
 from stages import Scene, trainer_of

@@ -13,9 +13,8 @@ import statistics
 import drgs  # noqa: F401  (registers the integrator)
 import drjit as dr
 import mitsuba as mi
-from drgs.bench.output import machine, markdown_table
+from drgs.bench.output import machine, markdown_table, seconds
 from drgs.bench.scenes import bench_camera, bench_gaussians, mitsuba_sensor
-from drgs.bench.timing import seconds
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 
 IMAGE_SIZE_PX = 400

@@ -27,9 +27,8 @@ import drjit as dr
 import drjit.llvm.ad as llvm
 import mitsuba as mi
 import numpy as np
-from drgs.bench.output import machine, markdown_table
+from drgs.bench.output import machine, markdown_table, seconds
 from drgs.bench.scenes import bench_camera, bench_gaussians
-from drgs.bench.timing import seconds
 from drgs.core.private import disable_avx512
 from drgs.splatting.grid import PIXELS
 from machine_code import MachineCodeError, assembly, count_operations, innermost_loop

@@ -28,8 +28,7 @@ import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from drgs.bench.output import machine, markdown_table
-from drgs.bench.timing import seconds
+from drgs.bench.output import machine, markdown_table, seconds
 from drgs.config.changes import with_changes
 from drgs.core.environment import denormals_flushed
 from drgs.core.processes import end_job_on_error, process_number

@@ -21,9 +21,8 @@ import drgs  # noqa: F401  (registers the plugin, in the fresh process too)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from drgs.bench.output import columns_table, machine, markdown_table
+from drgs.bench.output import columns_table, machine, markdown_table, seconds
 from drgs.bench.scenes import bench_camera, bench_gaussians
-from drgs.bench.timing import seconds
 from drgs.io.figures import new_figure, write_figure
 from drgs.results.history import write_csv
 from stages import STAGES, Scene, Work, clocked_step, count_work, frame_of, steps, warm_trainer

@@ -16,8 +16,8 @@ from support.views import Scene, tensors
 
 from drgs.accuracy import error_budget as budgets
 from drgs.bench.scenes import device_camera, stress_scene
-from drgs.cameras.axes import OPENCV_TO_MITSUBA
 from drgs.cameras.lens import LENSES
+from drgs.cameras.viewpoints import OPENCV_TO_MITSUBA
 from drgs.config.approximations import FALLOFFS, Approximations, parse_error
 from drgs.core.errors import PluginError
 from drgs.core.registry import temporary_registrations

@@ -11,8 +11,7 @@ import yaml
 from PIL import Image
 from support.small_capture import FOCUS, pose_around
 
-from drgs.cameras.axes import between_opencv_and_opengl
-from drgs.cameras.viewpoints import CameraMotion, pinhole
+from drgs.cameras.viewpoints import CameraMotion, between_opencv_and_opengl, pinhole
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError

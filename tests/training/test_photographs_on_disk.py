@@ -16,7 +16,7 @@ from support.datasets import load, load_noting
 from support.fit_command import VALUES, assert_fits, run_fit, write_project
 
 from drgs import train
-from drgs.cameras.axes import between_opencv_and_opengl
+from drgs.cameras.viewpoints import between_opencv_and_opengl
 from drgs.core.errors import UserError
 from drgs.datasets import images
 from drgs.datasets.images import DiskStore, is_on_disk

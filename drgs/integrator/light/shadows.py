@@ -21,8 +21,7 @@ import drjit as dr
 import mitsuba as mi
 
 from drgs.core.constants import SH_C0
-from drgs.gaussians.parameters import Gaussians
-from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.gaussians.parameters import Gaussians, quat_to_rotation
 from drgs.integrator.light.rays import StraightRays, has_transparent_parts
 from drgs.integrator.light.splat_transport import check_ids, ray_splats_of
 from drgs.integrator.light.surfaces import Surfaces, scene_of

@@ -26,7 +26,7 @@ from drgs.core.arrays import from_host, types_of
 from drgs.core.errors import UserError
 from drgs.core.types import Array3f, Float, UInt32
 from drgs.datasets.types import Dataset
-from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.gaussians.parameters import quat_to_rotation
 from drgs.training.density.strategy import (
     DensityReport,
     DensityStrategy,

@@ -19,7 +19,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.arrays import from_host, types_of
 from drgs.core.types import Array2f, Bool, Float, TensorXf
 from drgs.datasets.types import Dataset
-from drgs.gaussians.quaternions import quat_to_rotation
+from drgs.gaussians.parameters import quat_to_rotation
 from drgs.training.optimizer import Population
 
 
