@@ -43,8 +43,7 @@ from drgs.io.figures import new_figure, write_figure
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.results import metrics
-from drgs.results.files import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS
-from drgs.results.folder import require_results
+from drgs.results.folder import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, require_results
 from drgs.results.model_arguments import error_budget
 from drgs.splatting import rendering
 

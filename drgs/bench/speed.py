@@ -26,7 +26,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import splatting as reference
-from drgs.results.files import GAUSSIANS
+from drgs.results.folder import GAUSSIANS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -34,7 +34,7 @@ from drgs.export.levels import LOD_META, encode_levels
 from drgs.export.source import ExportSource, Honoured, load_source
 from drgs.io import sog
 from drgs.io.formats import format_for, writable_formats
-from drgs.results.files import VIEWS
+from drgs.results.folder import VIEWS
 from drgs.results.html_viewer import HONOURED, DisplaySettings, InitialView, viewer_page
 
 COMMAND = "export"

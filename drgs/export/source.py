@@ -17,8 +17,7 @@ from drgs.core.errors import UserError, UserNote
 from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.similarity import Similarity, shortest_rotation
-from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS
-from drgs.results.folder import load_run_config, require_results
+from drgs.results.folder import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, load_run_config, require_results
 from drgs.results.refined_cameras import training_cameras
 
 Honoured = Callable[[Approximations], frozenset[str]]

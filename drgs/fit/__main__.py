@@ -29,8 +29,7 @@ from drgs.datasets.folders import config_for
 from drgs.fit.budget import Budget, parse_duration
 from drgs.fit.fit_folder import FitFolder
 from drgs.fit.session import FitSession
-from drgs.results.files import CONFIG, EVENTS
-from drgs.results.folder import load_moved_config
+from drgs.results.folder import CONFIG, EVENTS, load_moved_config
 from drgs.training.parallel.communicator import Communicator
 
 if TYPE_CHECKING:  # imported with --view

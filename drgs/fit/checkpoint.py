@@ -16,8 +16,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, format_names, one_line
 from drgs.core.files import atomic_path, read_arrays, refusal_reason
 from drgs.fit.fingerprint import Fingerprint
-from drgs.results.files import CHECKPOINT, CONFIG
-from drgs.results.folder import write_run_config
+from drgs.results.folder import CHECKPOINT, CONFIG, write_run_config
 from drgs.results.history import DENSITY_COLUMNS, HistoryRow
 from drgs.training.trainer import DENSITY
 

@@ -28,7 +28,7 @@ from drgs.fit.inputs import versions
 from drgs.fit.loop import History
 from drgs.fit.report import MAX_PICTURES, FitImages, write_images, write_results
 from drgs.gaussians.parameters import Gaussians
-from drgs.results import files, folder
+from drgs.results import folder
 from drgs.results.history import write_density, write_history
 from drgs.results.html_viewer import DisplaySettings, shows_as_fitted
 from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
@@ -88,12 +88,12 @@ class FitFolder:
 
     def write_plan(self, text: str) -> None:
         """Write the plan and its reasons."""
-        with atomic_path(self.path / files.BUDGET_PLAN) as temporary:
+        with atomic_path(self.path / folder.BUDGET_PLAN) as temporary:
             temporary.write_text(text)
 
     def write_examination(self, examination: ChosenEffects) -> None:
         """Write what was chosen, and why."""
-        with atomic_path(self.path / files.EXAMINATION) as temporary:
+        with atomic_path(self.path / folder.EXAMINATION) as temporary:
             temporary.write_text(examination.to_json())
 
     def with_examination(self, config: FitConfig) -> FitConfig | None:
@@ -101,7 +101,7 @@ class FitFolder:
 
         None: there is no such run. Given values stay.
         """
-        path = self.path / files.EXAMINATION
+        path = self.path / folder.EXAMINATION
         if self.overwrites or not path.is_file():
             return None
         try:
@@ -117,7 +117,7 @@ class FitFolder:
     @property
     def remedy(self) -> str:
         """Advice after numbers that are not finite."""
-        has_checkpoint = (self.path / files.CHECKPOINT).exists()
+        has_checkpoint = (self.path / folder.CHECKPOINT).exists()
         kept = "the last checkpoint is kept" if has_checkpoint else "nothing was saved yet"
         return (
             f"{kept}. --resume {self.path} --debug repeats this with range checks; lower learning "
@@ -137,12 +137,12 @@ class FitFolder:
         for_viewers: None if other viewers render as the fit does; wall_s: time of iterations.
         """
         out, config, dataset, render = self.path, trainer.config, trainer.dataset, trainer.images
-        saved_gaussians(gaussians, config).save(out / files.GAUSSIANS)
+        saved_gaussians(gaussians, config).save(out / folder.GAUSSIANS)
         for effect in trainer.effects:
             effect.write(out, dataset)
-        write_history(out / files.HISTORY, history.rows)
-        write_density(out / files.DENSITY, history.density)
-        write_views(out / files.VIEWS, dataset)
+        write_history(out / folder.HISTORY, history.rows)
+        write_density(out / folder.DENSITY, history.density)
+        write_views(out / folder.VIEWS, dataset)
         folder.write_run_config(out, config)
         output, split = config.output, dataset.test_split
         scores = write_images(out, dataset, render, output.save_renders, output.report)
@@ -151,7 +151,7 @@ class FitFolder:
         other, approximations = None, config.model.approximations
         if for_viewers is not None:
             other = for_viewers.gaussians
-            other.save(out / files.GAUSSIANS_FOR_VIEWERS)
+            other.save(out / folder.GAUSSIANS_FOR_VIEWERS)
             views = evenly_spaced(dataset.test, MAX_PICTURES)
             images = zip(for_viewers.images(views), views, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
@@ -200,17 +200,17 @@ class FitFolder:
             f"{metrics['iterations']} iterations in {metrics['wall_s']:.0f} s"
         ]
         if viewers is not None:
-            path = self.path / files.GAUSSIANS_FOR_VIEWERS
+            path = self.path / folder.GAUSSIANS_FOR_VIEWERS
             lines.append(f"as other viewers show {path}: PSNR {viewers['psnr']:.2f} dB")
         lines.append(f"written: {self.path}")
         if cast("dict[str, object]", metrics["config"]["output"])["report"]:
-            lines.append(f"open {self.path / files.REPORT}")
+            lines.append(f"open {self.path / folder.REPORT}")
         return "\n".join(lines)
 
     def finish(self, metrics: FitMetrics | None = None) -> None:
         """Write ``metrics.json`` (None: it exists), and end the run by removing the checkpoint."""
         if metrics is not None:
-            write_json(self.path / files.METRICS, metrics, indent=2)
+            write_json(self.path / folder.METRICS, metrics, indent=2)
         remove_checkpoint(self.path)
         folder.seal_run(self.path)
 

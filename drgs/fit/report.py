@@ -31,7 +31,7 @@ from drgs.fit.ranking import RankedPhotograph, Render, rank_photographs
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
 from drgs.io.images import encode, to_uint8, write_animation, write_png
-from drgs.results.files import (
+from drgs.results.folder import (
     CURVES,
     GAUSSIANS,
     GAUSSIANS_FOR_VIEWERS,

@@ -38,7 +38,7 @@ from drgs.integrator.scene import render_views
 from drgs.io.formats import format_to_read, readable_formats
 from drgs.render.images import render_model
 from drgs.render.mitsuba_scene import render_mitsuba_scene
-from drgs.results.files import CONFIG, METRICS
+from drgs.results.folder import CONFIG, METRICS
 from drgs.results.model import (
     Render,
     load_model,

@@ -23,7 +23,7 @@ from drgs.core.files import write_json
 from drgs.datasets.camera_file import read_viewpoints
 from drgs.effects.cameras import CAMERAS, CamerasConfig
 from drgs.io.images import check_animation, write_animation
-from drgs.results.files import METRICS, ORBIT
+from drgs.results.folder import METRICS, ORBIT
 from drgs.results.metrics import mean_of, psnr, ssim
 from drgs.results.model import ImageFolder, Model
 from drgs.results.model_arguments import UP

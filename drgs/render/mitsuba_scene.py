@@ -14,7 +14,7 @@ from drgs.core.files import shorten_stem
 from drgs.integrator.state import is_splats
 from drgs.io.images import write_exr
 from drgs.io.scenes import load_scene_file
-from drgs.results.files import ERROR_BUDGET
+from drgs.results.folder import ERROR_BUDGET
 from drgs.results.model import BUDGET_KEY, ImageFolder
 
 

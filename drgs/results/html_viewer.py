@@ -31,7 +31,7 @@ from drgs.core.origin import WORLD
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.similarity import Similarity
-from drgs.results.files import VIEWER
+from drgs.results.folder import VIEWER
 from drgs.results.refined_cameras import refined_viewpoints
 
 MAX_PAGE_BYTES = 25_000_000

@@ -36,8 +36,7 @@ from drgs.integrator.scene import (
 from drgs.integrator.state import SplatsState, is_splats
 from drgs.integrator.summary import format_effects, summary_of_views
 from drgs.io.images import write_png
-from drgs.results.files import CONFIG, ERROR_BUDGET, GAUSSIANS
-from drgs.results.folder import relocate_data, require_results
+from drgs.results.folder import CONFIG, ERROR_BUDGET, GAUSSIANS, relocate_data, require_results
 from drgs.results.refined_cameras import refined_dataset
 
 if TYPE_CHECKING:  # imported where there is an error budget

@@ -16,8 +16,7 @@ from drgs.datasets.camera_file import cameras_json, read_viewpoints
 from drgs.datasets.transforms import MAX_BYTES
 from drgs.datasets.types import Dataset, View
 from drgs.effects.cameras import CAMERAS, CamerasConfig, LensChange
-from drgs.results.files import VIEWS
-from drgs.results.folder import load_run_config
+from drgs.results.folder import VIEWS, load_run_config
 
 
 def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:

@@ -27,7 +27,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.io.formats import writable_formats
 from drgs.results import metrics
-from drgs.results.files import CONFIG
+from drgs.results.folder import CONFIG
 
 
 def round_trip(gaussians: Gaussians, each: Extension) -> tuple[Gaussians, int, float, float]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from drgs.config.load import dump_config
 from drgs.config.schema import FitConfig
 from drgs.io.figures import new_figure, write_figure
-from drgs.results.files import METRICS
+from drgs.results.folder import METRICS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -42,7 +42,7 @@ from drgs.datasets.types import View, evenly_spaced
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import initial_gaussians
-from drgs.results.files import HISTORY
+from drgs.results.folder import HISTORY
 from drgs.results.metrics import psnr
 from drgs.training.density.budget import GROWTH_SHARE, GrowthToNumber
 from drgs.training.density.strategy import DensityReport

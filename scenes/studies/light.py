@@ -27,7 +27,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.io.scenes import load_scene_file
 from drgs.results import metrics
-from drgs.results.files import GAUSSIANS
+from drgs.results.folder import GAUSSIANS
 from fits import SCENES
 
 if TYPE_CHECKING:

@@ -35,8 +35,7 @@ from drgs.integrator.scene import make_scene, render_views
 from drgs.io.colmap import read_model
 from drgs.io.images import image_size, read_image, write_png
 from drgs.poses.structure_from_motion import SfmSettings, reconstruct
-from drgs.results.files import GAUSSIANS
-from drgs.results.folder import load_run_config
+from drgs.results.folder import GAUSSIANS, load_run_config
 from drgs.results.metrics import mean_of
 from fits import add_case_option, fit_words, make_parser
 

@@ -26,7 +26,7 @@ from drgs.config.load import load_config
 from drgs.config.schema import DensifyConfig, FitConfig
 from drgs.datasets import load_dataset
 from drgs.fit import __main__ as fit
-from drgs.results.files import HISTORY
+from drgs.results.folder import HISTORY
 from drgs.training.density.adc import AdaptiveDensityControl
 from drgs.training.density.strategy import DensityReport, Population
 from fits import SCENES, add_case_option, make_parser, read_metrics, write_curves

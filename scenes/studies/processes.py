@@ -34,8 +34,7 @@ from drgs.core.environment import denormals_flushed
 from drgs.core.processes import end_job_on_error, process_number
 from drgs.datasets import load_dataset
 from drgs.gaussians.parameters import Gaussians
-from drgs.results.files import GAUSSIANS
-from drgs.results.folder import load_run_config
+from drgs.results.folder import GAUSSIANS, load_run_config
 from drgs.training.parallel import exchange
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import Trainer

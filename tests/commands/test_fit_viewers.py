@@ -34,8 +34,7 @@ from drgs.fit.live_view import TrainingViewer, unless_ended
 from drgs.gaussians.parameters import Gaussians
 from drgs.live_page.frames import FrameRequest, ViewerCamera
 from drgs.live_page.scheduler import RenderRequests
-from drgs.results.files import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS
-from drgs.results.folder import remove_run
+from drgs.results.folder import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS, remove_run
 
 EYE = ViewerCamera(pose_around(0.4, 0.3), 40.0, 4.0)
 

@@ -38,7 +38,7 @@ from drgs.export import __main__ as export
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.results.files import VIEWS
+from drgs.results.folder import VIEWS
 from drgs.results.refined_cameras import write_views
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)

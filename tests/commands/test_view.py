@@ -14,7 +14,7 @@ from drgs.cli.commands import CommandParser
 from drgs.core.errors import UserError
 from drgs.effects.cameras import CAMERAS
 from drgs.live_page.page import StartView
-from drgs.results.files import VIEWS
+from drgs.results.folder import VIEWS
 from drgs.results.model import load_model
 from drgs.results.refined_cameras import write_views
 from drgs.view import __main__ as view

@@ -16,7 +16,7 @@ from support.fit_command import (
     write_project,
 )
 
-from drgs.results.files import EVENTS, HISTORY, TENSORBOARD
+from drgs.results.folder import EVENTS, HISTORY, TENSORBOARD
 
 
 @pytest.fixture(autouse=True)

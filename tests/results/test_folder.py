@@ -12,16 +12,17 @@ from drgs.config.extensions import EFFECTS
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
-from drgs.results import files
-from drgs.results.files import METRICS, result_names
+from drgs.results import folder as files
 from drgs.results.folder import (
     FOLDERS,
+    METRICS,
     check_output_folder,
     claim_output_folder,
     image_names,
     is_finished,
     load_run_config,
     remove_run,
+    result_names,
 )
 from drgs.results.model import load_open_config
 

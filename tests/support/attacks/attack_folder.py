@@ -25,7 +25,7 @@ import yaml
 from drgs.capture import __main__ as capture
 from drgs.core.files import atomic_path
 from drgs.fit import __main__ as fit
-from drgs.results.files import CHECKPOINT, CURVES, ORBIT, REPORT, VIEWER
+from drgs.results.folder import CHECKPOINT, CURVES, ORBIT, REPORT, VIEWER
 from support.attacks.attack import Fault, observed
 from support.commands import assert_ends_well, run_in_process
 from support.datasets import write_points
