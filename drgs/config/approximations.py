@@ -8,7 +8,6 @@ and the properties of the plugin ``splats`` (``drgs.integrator.properties``).
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
@@ -18,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from drgs.core.constants import ALPHA_CUT, ALPHA_MAX, LOW_PASS, TRANSMITTANCE_STOP
-from drgs.core.errors import UserError, UserNote, did_you_mean, format_names, one_line
+from drgs.core.errors import UserError, did_you_mean, format_names, note_user, one_line
 from drgs.core.registry import HOW_TO_INSTALL, ClassRegistry
 
 Value = bool | int | float | str
@@ -242,7 +241,7 @@ def from_ply_header(where: str, values: Mapping[str, Value]) -> dict[str, Value]
     if unknown:
         hint = did_you_mean(unknown[0], DECLARED)
         note = f"{where}: specifies {format_names(unknown)}, which is not known here and ignored"
-        warnings.warn(UserNote(note + hint), stacklevel=2)
+        note_user(note + hint)
     known: dict[str, Value] = {}
     for name, declared in DECLARED.items():
         if name not in values:

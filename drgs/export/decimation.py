@@ -6,7 +6,6 @@ Gaussians from many cameras. No photographs are used.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
@@ -18,7 +17,7 @@ import numpy as np
 from drgs.cameras.orbits import extent_of
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.config.schema import ModelConfig
-from drgs.core.errors import UserNote
+from drgs.core.errors import note_user
 from drgs.core.types import TensorXf
 from drgs.export.merging import merge_down
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -72,8 +71,7 @@ def decimate(
         dr.backward(dr.mean(dr.square(image - expected), axis=None))
         optimizer.step()
     if not all(np.isfinite(np.array(optimizer[key])).all() for key in rates):
-        note = "the remaining Gaussians are merged, but not fitted: a number became infinite"
-        warnings.warn(UserNote(note), stacklevel=2)
+        note_user("the remaining Gaussians are merged, but not fitted: a number became infinite")
         return start
     fitted = {key.rpartition(".")[2]: np.array(optimizer[key]) for key in rates}
     shaped = {name: value.reshape(getattr(start, name).shape) for name, value in fitted.items()}

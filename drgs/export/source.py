@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from drgs.cameras.orbits import near_plane_of, rings_around
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.config.approximations import DECLARED, Approximations, from_ply_header
 from drgs.config.schema import FitConfig, ModelConfig
-from drgs.core.errors import UserError, UserNote
+from drgs.core.errors import UserError, note_user
 from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.similarity import Similarity, shortest_rotation
@@ -80,11 +79,10 @@ def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
     shown = frozenset() if honoured is None else honoured(Approximations.from_values(recorded))
     if unknown := [f"{k} {str(v).lower()}" for k, v in others.items() if k not in shown]:
         beside = path.with_name(GAUSSIANS_FOR_VIEWERS)
-        note = (
+        note_user(
             f"{path}: made to be rendered with {', '.join(unknown)}; programs that do not will "
             "show it otherwise" + (f"; export {beside} instead" if beside.is_file() else "")
         )
-        warnings.warn(UserNote(note), stacklevel=2)
     gaussians = bake_smoothing(replace(gaussians, rendered_with=others or None))
     cameras = None if config is None else training_cameras(what, gaussians.origin)
     return ExportSource(gaussians, path, config, cameras)

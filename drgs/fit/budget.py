@@ -15,7 +15,6 @@ import csv
 import math
 import re
 import time
-import warnings
 from argparse import ArgumentTypeError
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -28,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError, UserNote
+from drgs.core.errors import UserError, note_user
 from drgs.datasets.types import Dataset
 from drgs.effects.base import TrainingEffect
 from drgs.fit.inputs import share_inputs
@@ -289,12 +288,11 @@ def plan_fit(
     images = results.renders if config.output.save_renders else 0.0
     images += results.report if config.output.report else 0.0
     if images > MAX_IMAGES_SHARE * (end - time.perf_counter()):
-        note = (
+        note_user(
             "--budget: the time is needed for iterations: no report, orbit and images are "
             "written (output.report, output.save_renders); python -m drgs.render OUT_DIR --out DIR "
             "makes images"
         )
-        warnings.warn(UserNote(note), stacklevel=2)
         config = with_changes(config, {"output.report": False, "output.save_renders": False})
     else:
         end -= images

@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
@@ -25,7 +24,7 @@ from drgs.config.extensions import EXAMINERS
 from drgs.config.load import config_from, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
-from drgs.core.errors import UserError, UserNote
+from drgs.core.errors import UserError, note_user
 from drgs.core.memory import release_unused_memory
 from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
@@ -300,11 +299,10 @@ class FitSession:
         trainer, wall_s = self.trainer, self.history.wall_s
         gaussians, wanted = trainer.gaussians(), trainer.config.densify.prune.to
         if self.comm.is_root and wanted is not None and trainer.num_gaussians > wanted:
-            note = (
+            note_user(
                 f"time was up before there were only densify.prune.to = {wanted:,} Gaussians: "
                 f"there are {trainer.num_gaussians:,}; give --budget more time"
             )
-            warnings.warn(UserNote(note), stacklevel=2)
         release_unused_memory()  # encoding the orbit's frames takes as much as iterations do
         trainer.full_scene()  # gathered from all ranks
         for_viewers = None

@@ -9,7 +9,6 @@ cameras and colours. The fit's own Gaussians do not depend on it.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -20,7 +19,7 @@ import numpy as np
 from drgs.config.approximations import DECLARED
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig, ModelConfig
-from drgs.core.errors import UserError, UserNote
+from drgs.core.errors import UserError, note_user
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import View
 from drgs.effects.base import TrainingEffect
@@ -83,8 +82,7 @@ def for_viewers(
             watch(tuner.iteration - trainer.iteration)
         tuned = tuner.gaussians()
     except UserError as error:  # numbers that are not finite, or too little memory by now
-        note = f"the Gaussians for viewers are not fitted any further: {error}"
-        warnings.warn(UserNote(note), stacklevel=2)
+        note_user(f"the Gaussians for viewers are not fitted any further: {error}")
         tuned = start
     release_unused_memory()  # share of the time of those iterations
     gaussians = replace(tuned, rendered_with={name: DECLARED[name].default for name in others})

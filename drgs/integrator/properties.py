@@ -7,7 +7,6 @@ and the given value; for a wrong type, ``PluginTypeError``.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -26,7 +25,7 @@ from drgs.config.approximations import (
     from_ply_header,
 )
 from drgs.core.constants import MAX_INT, NEAR
-from drgs.core.errors import PluginError, PluginTypeError, UserNote, did_you_mean
+from drgs.core.errors import PluginError, PluginTypeError, did_you_mean, note_user
 from drgs.core.origin import WORLD, format_origin
 from drgs.effects.compose import IGNORABLE
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
@@ -229,11 +228,10 @@ def load_gaussians(props: mi.Properties) -> Gaussians:
         path = resolver.resolve(str(props["filename"]))
         gaussians = Gaussians.load(str(path))
         if gaussians.origin != WORLD:  # float32 requires positions relative to it
-            note = (
+            note_user(
                 f"{path}: positions are relative to {format_origin(gaussians.origin)}; place "
                 "sensors and shapes relative to that"
             )
-            warnings.warn(UserNote(note), stacklevel=2)
         gaussians = replace(gaussians.to(mi.TensorXf), origin=WORLD, features=features)
     elif given or features or "to_world" in props:
         gaussians = replace(_gaussians_of_tensors(props, given), features=features)

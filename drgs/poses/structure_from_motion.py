@@ -13,7 +13,6 @@ import re
 import shlex
 import shutil
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -27,7 +26,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from drgs.core.environment import require_module
-from drgs.core.errors import UserError, UserNote, format_names, one_line
+from drgs.core.errors import UserError, format_names, note_user, one_line
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.colmap import find_model
 from drgs.datasets.files import is_image, masks_of, without_masks
@@ -147,8 +146,7 @@ def photographs_in(folder: Path) -> tuple[Path, list[str]]:
             f"{folder}: must hold photographs, or have them in a folder images, got {got}"
         )
     if others:
-        note = f"{photographs}: left out, as COLMAP does not read them: {others}"
-        warnings.warn(UserNote(note), stacklevel=2)
+        note_user(f"{photographs}: left out, as COLMAP does not read them: {others}")
     for file in files:
         read_header(file)  # a fit would refuse it after hours of work
         if os.fsencode(file) != str(file).encode(errors="replace"):

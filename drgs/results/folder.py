@@ -18,7 +18,7 @@ from drgs.config.changes import with_changes, with_decisions
 from drgs.config.extensions import EFFECTS
 from drgs.config.load import dump_config, load_config
 from drgs.config.schema import FitConfig
-from drgs.core.errors import UserError, UserNote, format_names, one_line
+from drgs.core.errors import UserError, UserNote, format_names, note_user, one_line
 from drgs.core.files import is_temporary, read_text, refusal_reason, remove_stale_temporaries
 from drgs.core.folders import FolderRecord
 
@@ -144,8 +144,7 @@ def write_run_config(folder: Path, config: FitConfig) -> None:
     except UserError:
         is_same = False
     if not is_same:
-        note = f"{path}: was changed after the fit wrote it, and is kept"
-        warnings.warn(UserNote(note), stacklevel=2)
+        note_user(f"{path}: was changed after the fit wrote it, and is kept")
 
 
 def require_no_run(folder: Path) -> None:
@@ -220,8 +219,7 @@ def relocate_data(folder: Path, config: FitConfig, keys: Sequence[str] = DATA_PA
         found = Path(os.path.normpath(folder.resolve() / recorded[key]))
         if found.exists():
             changes[key] = str(found)
-            note = f"{key}: {path} is not there any more; taken from {found}"
-            warnings.warn(UserNote(note), stacklevel=2)
+            note_user(f"{key}: {path} is not there any more; taken from {found}")
     return with_changes(config, changes) if changes else config
 
 

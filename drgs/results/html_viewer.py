@@ -13,7 +13,6 @@ import gzip
 import html
 import json
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -25,7 +24,7 @@ import numpy as np
 from drgs.cameras.orbits import Orbit, orbit_of_gaussians, orbit_of_views
 from drgs.cameras.viewpoints import FIELD_OF_VIEW, Viewpoint
 from drgs.config.approximations import Approximations
-from drgs.core.errors import UserNote
+from drgs.core.errors import note_user
 from drgs.core.files import atomic_path
 from drgs.core.origin import WORLD
 from drgs.datasets.types import Dataset
@@ -168,11 +167,10 @@ def write_viewer(out: Path, dataset: Dataset, shown: DisplaySettings) -> None:
     gaussians = shown.gaussians
     size = estimate_page_bytes(gaussians.num_gaussians, gaussians.sh_degree)
     if size > MAX_PAGE_BYTES:
-        note = (
+        note_user(
             f"{out / VIEWER}: not written, as it would have about {size / 1e6:.0f} MB, more than "
             f"{MAX_PAGE_BYTES / 1e6:.0f}; drgs export {out} --format html writes it"
         )
-        warnings.warn(UserNote(note), stacklevel=2)
         return
     views = refined_viewpoints(out, dataset.origin) or dataset.train
     initial_view = InitialView.from_views(views, gaussians)
