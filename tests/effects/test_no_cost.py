@@ -1,4 +1,4 @@
-"""What a scene does not use costs nothing: it is not imported, and leaves nothing in a kernel."""
+"""Alternatives and effects that a scene does not use cost nothing: no import, no trace in kernels."""
 
 import json
 from pathlib import Path
