@@ -204,15 +204,12 @@ def test_help_shows_the_command_with_an_example(main, words, called):
 
 
 @pytest.mark.parametrize(
-    ("module", "file"),
-    [
-        *((name, f"{name}.__main__") for name in ("drgs", "drgs.capture")),
-        *((name, name) for name in ("drgs.fit", "drgs.render", "drgs.export", "drgs.view")),
-    ],
+    "module", ["drgs", *(f"drgs.{name}" for name in ("capture", "fit", "render", "export", "view"))]
 )
-def test_modules_run_as_commands(module, file, monkeypatch, capsys):
+def test_modules_run_as_commands(module, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [module, "--help"])
-    monkeypatch.delitem(sys.modules, file, raising=False)  # as if it had not been imported
+    # As if it had not been imported.
+    monkeypatch.delitem(sys.modules, f"{module}.__main__", raising=False)
     with pytest.raises(SystemExit) as end:
         runpy.run_module(module, run_name="__main__")
     assert end.value.code == 0

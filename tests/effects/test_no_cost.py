@@ -1,4 +1,4 @@
-"""Alternatives and effects that a scene does not use cost nothing: no import, no trace in kernels."""
+"""Alternatives and effects that a scene does not use cost nothing in its kernels."""
 
 import json
 from pathlib import Path
