@@ -1,6 +1,4 @@
 """Measure drgs; write tables and plots.
 
 Each measurement shown in the documents is a command, ``drgs bench NAME``.
-
-May import everything.
 """

@@ -1,4 +1,1 @@
-"""Cameras in OpenCV axes; one lens a file, and how a camera moves.
-
-May import ``core``.
-"""
+"""Cameras in OpenCV axes: one lens a file, motion, viewpoints without photographs, orbits."""

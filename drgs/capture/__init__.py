@@ -1,4 +1,1 @@
-"""Turn a Mitsuba scene into a training set.
-
-May import the packages that commands may import.
-"""
+"""Turn a Mitsuba scene into a training set."""

@@ -1,4 +1,1 @@
-"""Arguments, execution, progress and exit of all commands.
-
-May import ``core``.
-"""
+"""Arguments, execution, progress and exit of all commands."""

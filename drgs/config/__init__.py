@@ -1,4 +1,1 @@
-"""Typed settings of a fit, and the YAML they are read from.
-
-May import ``core``.
-"""
+"""Typed settings of a fit, and the YAML they are read from."""

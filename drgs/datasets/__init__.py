@@ -1,7 +1,4 @@
-"""Datasets: photographs with cameras, read from folders, and viewpoints without photographs.
-
-May import ``io``, ``config``, ``gaussians``, ``cameras`` and ``core``.
-"""
+"""Datasets: photographs with cameras, read from folders, and cameras of files."""
 
 from __future__ import annotations
 

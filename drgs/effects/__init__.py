@@ -1,4 +1,1 @@
-"""Effects besides splats before a pinhole, each imported when a scene uses it.
-
-May import ``splatting``, ``config``, ``gaussians``, ``cameras`` and ``core``.
-"""
+"""Effects besides splats before a pinhole, each imported when a scene uses it."""

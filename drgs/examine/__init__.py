@@ -2,8 +2,6 @@
 
 Python gives ``drgs.examine`` to this package as soon as one of its modules is imported: so the
 package can be called, and stands for :func:`drgs.examine.examination.examine`.
-
-May import everything but other commands.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
 """Write Gaussians for other programs.
 
 They may be cleaned, decimated, merged, or made a mesh before.
-
-May import everything but other commands.
 """

@@ -1,6 +1,4 @@
 """Fit 3D Gaussians to posed photographs.
 
 A fit from its configuration to its files, and :func:`drgs.train`.
-
-May import everything but other commands.
 """

@@ -1,4 +1,1 @@
-"""The scene's type, its spherical harmonics, and how both are turned.
-
-May import ``io`` and ``core``.
-"""
+"""The scene's type, its spherical harmonics, and how both are turned."""

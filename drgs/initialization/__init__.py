@@ -1,4 +1,1 @@
-"""Start of a fit: initial Gaussians from points, masks or cameras, and defaults from the dataset.
-
-May import ``datasets`` and what that may import.
-"""
+"""Initial Gaussians from points, masks or cameras, and defaults that follow from the dataset."""

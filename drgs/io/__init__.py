@@ -1,4 +1,1 @@
-"""Files: Gaussians, points, COLMAP's models, images, animations, figures; needs no libLLVM.
-
-May import ``core``.
-"""
+"""Files: Gaussians, points, COLMAP's models, images, animations, figures; needs no libLLVM."""

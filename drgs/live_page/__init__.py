@@ -1,5 +1,5 @@
 """Live pages in a browser, rendered by this process: of ``drgs view``, and of a running fit.
 
-May import ``results`` and what that may import. ``frames`` renders and ``scheduler`` chooses times
-and sizes, both without a browser; ``server`` serves a ``page`` with viser.
+``frames`` renders and ``scheduler`` chooses times and sizes, both without a browser; ``server``
+serves a ``page`` with viser.
 """

@@ -1,4 +1,1 @@
-"""Render Gaussians, a fit, or a Mitsuba scene.
-
-May import everything but other commands.
-"""
+"""Render Gaussians, a fit, or a Mitsuba scene."""

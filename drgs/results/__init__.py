@@ -1,4 +1,1 @@
-"""The results of a fit: its folder, metrics, report, curves and refined cameras.
-
-May import ``integrator``, ``data``, ``io``, ``config``, ``gaussians``, ``cameras`` and ``core``.
-"""
+"""What commands share: a fit's folder, history, metrics, models to render, ``viewer.html``."""

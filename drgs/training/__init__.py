@@ -1,4 +1,1 @@
-"""The training loop and its parts.
-
-May import everything but the commands, the plugins and ``bench``.
-"""
+"""A step of a fit: the trainer and its parts, without folders, clocks and terminals."""

@@ -1,4 +1,1 @@
-"""Look at Gaussians in a browser, rendered live.
-
-May import everything but other commands.
-"""
+"""Look at Gaussians in a browser, rendered live."""

@@ -1,4 +1,1 @@
-"""Strategies that change the number of Gaussians, of which a fit has one.
-
-May import what ``training`` may, but nothing of the trainer.
-"""
+"""Strategies that change the number of Gaussians, of which a fit has one."""
