@@ -1,1 +1,1 @@
-"""What commands share: a fit's folder, history, metrics, models to render, ``viewer.html``."""
+"""Shared parts of commands: a fit's folder, history, metrics, models to render, ``viewer.html``."""
