@@ -23,7 +23,7 @@ from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import format_effects, summary_of_sensors, summary_of_views
 
 MODULES = """
-    accuracy.exact accuracy.pixel_lists accuracy.pixel_order accuracy.ray_colors accuracy.unscented
+    accuracy.exact accuracy.pixel_order accuracy.ray_colors accuracy.unscented
     cameras.distortion cameras.fisheye cameras.motion cameras.orthographic cameras.radial_tangential
     cameras.thin_prism_fisheye effects.defocus effects.occlusion effects.smoothing
     gaussians.rotation gaussians.similarity integrator.parts integrator.light.splat_transport
@@ -260,7 +260,7 @@ STEPS = {
     "show(sky)": "",
     "show(projection='exact')": "accuracy.exact",
     "show(projection='unscented')": "accuracy.unscented",
-    "show(order='pixel')": "accuracy.pixel_lists accuracy.pixel_order",
+    "show(order='pixel')": "accuracy.pixel_order",
     "show(sh_direction='pixel')": "accuracy.ray_colors",
     "show(kind='calibrated', sensor={'lens': 'opencv', 'k1': 0.1})": (
         "cameras.distortion cameras.radial_tangential"
