@@ -134,8 +134,11 @@ def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
                 raise ValueError("its arrays are larger than the file")
         file.seek(0)
         require_memory(path, size, f"the {what}")
-        with np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+        try:
+            with np.load(file, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
+        except MemoryError as error:  # there is enough for the file: a header is wrong
+            raise ValueError(error) from None
 
 
 _TEMPORARY_NAME = re.compile(r"\.(.*)\.(\d{1,9})\.tmp(\.[^.]*)?")

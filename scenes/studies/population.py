@@ -59,7 +59,7 @@ def prune_added_rows_immediately() -> Iterator[None]:
         keep = np.flatnonzero((opacities >= rules.prune_opacity) & (scales <= limit))
         if len(keep) == report.num_gaussians:
             return report
-        rows.edit(rows.rows(keep))
+        rows.edit(rows.to_device_indices(keep))
         pruned = report.pruned + report.num_gaussians - len(keep)
         return replace(report, pruned=pruned, num_gaussians=len(keep))
 

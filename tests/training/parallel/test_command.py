@@ -107,7 +107,7 @@ def test_processes_share_the_frames_of_an_orbit(tmp_path):
         outputs.append(output.replace(str(out), "OUT"))
         files.append({p.name: p.read_bytes() for p in out.iterdir() if p.suffix != ".json"})
     assert outputs[0] == outputs[1]
-    assert files[0] == files[1] and len(files[0]) == 7  # frames, and two animations
+    assert files[0] == files[1] and len(files[0]) == 6  # frames, and an animation
 
 
 MISSING = "ModuleNotFoundError('No module named mpi4py', name='mpi4py')"
