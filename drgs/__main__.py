@@ -14,7 +14,7 @@ from drgs.core.environment import describe_installation
 from drgs.core.registry import modules_of
 
 GROUP = "drgs.commands"
-"""Of entry points: the value is a package, whose ``__main__`` has ``add_arguments``."""
+"""Group of entry points whose values are packages with ``add_arguments`` in ``__main__``."""
 
 
 def commands() -> dict[str, Subcommand]:

@@ -45,7 +45,7 @@ ANY_KIND = "drgs"
 HOW_TO_INSTALL = 'others come with installed packages that have an entry point of the group "drgs"'
 
 PROJECT = Path(__file__).parents[2] / "pyproject.toml"
-"""Of a checkout, whose installed metadata may be older."""
+"""Project file of a checkout, whose installed metadata may be older."""
 
 T = TypeVar("T")
 Registered = TypeVar("Registered")

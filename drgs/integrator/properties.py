@@ -120,7 +120,7 @@ LIGHT_SETTINGS = {
     "probe_fallback": one_of("none", "rays"),
     "radiance_scale": positive(1.0),
 }
-"""Those of light between splats and surfaces."""
+"""Settings of light between splats and surfaces."""
 
 FORMER_NAMES = {"unseen": "probe_fallback", "exposure": "radiance_scale"}
 """Names that properties of ``splats`` had, which are still read."""
