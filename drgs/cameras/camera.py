@@ -60,6 +60,7 @@ class Shutter(Protocol):
     """The shutter of a camera that moves while it is open: see ``drgs.cameras.motion``."""
 
     label: ClassVar[str]  # for messages
+    reads_rows: ClassVar[bool] = False  # one after the other: rolling
 
     def pose(self, camera: Camera, time: Scalar) -> Camera:
         """Return ``camera``, which is at time 0, at another time, without a shutter."""
@@ -83,6 +84,7 @@ class Camera(CameraParameters):
     lens: Lens = PINHOLE
     aperture: Aperture | None = None  # of a lens that blurs
     shutter: Shutter | None = None  # of a camera that moves while it is open
+    velocity: Array3f | None = None  # camera axes, of points, per time in which it reads all rows
 
     @staticmethod
     def create(
@@ -163,6 +165,10 @@ class Camera(CameraParameters):
     def for_means(self, means: Array3f) -> Camera:
         """Return the camera when a rolling shutter reads the rows of means (world)."""
         return self if self.shutter is None else self.shutter.camera_of(means, self)
+
+    def in_own_axes(self) -> Camera:
+        """Return the camera with its own axes as those of the world."""
+        return replace(self, rotation=dr.identity(type(self.rotation)))
 
     def numbers(self) -> list[Float]:
         """Return pose, focal lengths, principal point and lens as Float, in a fixed order."""

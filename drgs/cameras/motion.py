@@ -19,6 +19,12 @@ from drgs.core.types import Array3f, Bool, Float, Matrix3f, Scalar
 NEWTON_STEPS = 3
 """Steps of the search for a splat's time: pixels move little while the film is read."""
 
+MAX_ROW_RATE = 0.5
+"""Rows per row: where points run away from a rolling shutter as fast as it reads, they have no time
+at which they are read. Faster ones are taken as still."""
+
+MARGIN = 0.5  # of the time of all rows: the motion of splats beside the film goes on for it
+
 MIN_TURN_RAD = 1e-4
 """Radians: turns below this are composed by their series, the formulas being 0 / 0 at 0."""
 
@@ -51,12 +57,12 @@ class Motion(Shutter):
         )
 
     def velocity(self, camera: Camera, offset: Array3f) -> Array3f:
-        """Return the velocity of a point relative to the camera, world axes, per unit of time.
+        """Return the velocity of a point relative to the camera, camera axes, per unit of time.
 
         camera: at the time in question; offset: from its centre to the point, world.
         """
-        turn = camera.rotation.T @ dr.cross(self.turn, camera.rotation @ offset)
-        return turn - self.travel
+        turn = dr.cross(self.turn, camera.rotation @ offset)
+        return turn - camera.rotation @ self.travel
 
 
 @dataclass(frozen=True)
@@ -79,22 +85,25 @@ class RollingShutter(Motion):
     """The film's rows are read from the first, at time 0, to the last, at time 1."""
 
     label: ClassVar[str] = "rolling shutter"
+    reads_rows: ClassVar[bool] = True
 
     @override
     def camera_of(self, means: Array3f, camera: Camera) -> Camera:
         """Return the camera when it reads the row of the film that shows a mean.
 
         The time is that of the row on which the mean is seen then, by Newton's method, of which the
-        last step is differentiated (the implicit function theorem). A splat is projected as a whole
-        at the time of its mean.
+        last step is differentiated (the implicit function theorem); before the first and after the
+        last row, the motion goes on for :data:`MARGIN`. Other points of a splat are read at other
+        times: see ``drgs.effects.rolling_shutter``, which uses the ``velocity`` of the result.
         """
         still = dr.detach((means, camera))
         time = dr.full(type(means.x), 0.5, dr.width(means))
         for _ in range(NEWTON_STEPS):
             time, _ = self._step(*still, time)
-            time = dr.select(time < 0, 0, dr.select(time > 1, 1, time))
+            time = dr.clip(time, -MARGIN, 1 + MARGIN)
         moved, inside = self._step(means, camera, dr.detach(time))
-        return self.pose(camera, dr.select(inside, moved, time))
+        at = self.pose(camera, dr.select(inside, moved, time))
+        return replace(at, velocity=dr.select(inside, self.velocity(at, means - at.center), 0))
 
     def _step(self, means: Array3f, camera: Camera, time: Float) -> tuple[Float, Bool]:
         """Take a step of Newton's method; return the time, and whether it is on the film."""
@@ -104,12 +113,11 @@ class RollingShutter(Motion):
         height = camera.film_end.y - camera.film_start.y
         row = (at.lens.project_point(at, position).y - camera.film_start.y) / height
         with dr.suspend_grad():
-            _, down = at.lens.projection_jacobian(at, position)
+            _, down = at.lens.projection_jacobian(at.in_own_axes(), position)
             rate = dr.dot(down, self.velocity(at, offset)) / height
-            # Where rows run away from the reader as fast as it reads, no time is the right one.
-            rate = dr.select(seen & (rate < 0.5), rate, 0)
+            rate = dr.select(seen & (rate < MAX_ROW_RATE), rate, 0)
         moved = time + (row - time) / (1 - rate)
-        return moved, seen & (moved > 0) & (moved < 1)
+        return moved, seen & (moved > -MARGIN) & (moved < 1 + MARGIN)
 
 
 def rotation_vector(rotation: Matrix3f) -> Array3f:

@@ -23,6 +23,10 @@ def with_effects(pipeline: Pipeline, gaussians: Gaussians, camera: Camera) -> Pi
 
         model = replace(pipeline.model, falloff=DimmedFalloff(pipeline.model.falloff))
         pipeline = replace(pipeline, shape=Defocused(pipeline.shape), model=model)
+    if camera.shutter is not None and camera.shutter.reads_rows:
+        from drgs.effects.rolling_shutter import Sheared
+
+        pipeline = replace(pipeline, shape=Sheared(pipeline.shape))
     if gaussians.smoothing is not None:
         from drgs.effects.smoothing import apply_smoothing
 

@@ -29,6 +29,7 @@ from drgs.cameras.motion import (
     rotation_vector,
 )
 from drgs.core.arrays import types_of
+from drgs.effects.compose import with_effects
 from drgs.reference import effects
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
@@ -88,7 +89,9 @@ def test_horizontal_motion_is_exact_at_row_centers():
     end = lens_camera(close, effects.Pinhole(), FLOAT64)
     motion = Motion.relative_motion(device, end.rotation, end.center)
     device = replace(device, shutter=RollingShutter(*motion))
-    frame = rendering.render(device_gaussians(gaussians, FLOAT64), device, rendering.Pipeline(0))
+    splats = device_gaussians(gaussians, FLOAT64)
+    pipeline = with_effects(rendering.Pipeline(0), splats, device)
+    frame = rendering.render(splats, device, pipeline)
     alpha = 1 - planes_of(frame)[0].reshape(height, 32)
     expected = effects.render_rolling_shutter(gaussians, camera, close)
     rows_of_splats = y.astype(int)

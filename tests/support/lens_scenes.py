@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from unittest import mock
 
 import drjit as dr
@@ -230,22 +230,54 @@ def planes_of(frame) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------
 
 
-def row_time(camera_at, lens, mean) -> float:
-    """When the row that shows a mean is read: the root of its row less the time."""
+ROW_MARGIN, MAX_ROW_RATE = 0.5, 0.5
+"""The motion goes on before and after the film's rows; faster points are taken as still."""
+
+
+def row_time(camera_at, lens, mean) -> tuple[float, bool]:
+    """When the row that shows a mean is read, and whether it is read: the root of row less time."""
 
     def behind(time) -> float:
         camera = camera_at(time)
         point = (mean - camera.center) @ camera.rotation.T
         return lens.film_points(camera, point[None])[0, 1] / camera.height - time
 
-    if behind(0) <= 0:
-        return 0.0
-    return 1.0 if behind(1) >= 0 else brentq(behind, 0, 1, xtol=1e-15, rtol=1e-14)
+    first, last = -ROW_MARGIN, 1 + ROW_MARGIN
+    if behind(first) <= 0:
+        return first, False
+    if behind(last) >= 0:
+        return last, False
+    return brentq(behind, first, last, xtol=1e-15, rtol=1e-14), True
+
+
+def as_read(splat, gaussian, camera_at, lens, time) -> reference.Projection:
+    """The projection of one Gaussian at its time, sheared: rows below are read later.
+
+    With the velocity v on the film, px, by differences: A = (I - v e_y^T / height)^-1.
+    """
+    step, weights = 2.0**-7, effects.CENTRAL_WEIGHTS
+    steps = step * np.arange(1, len(weights) + 1)
+
+    def point(at) -> np.ndarray:
+        return (gaussian.means - camera_at(at).center) @ camera_at(at).rotation.T
+
+    moves = [point(time + each) - point(time - each) for each in steps]
+    place = effects._points_of_jacobian(lens, camera_at(time), point(time))
+    velocity = effects.jacobians(lens, camera_at(time), place)[0] @ (
+        np.tensordot(weights, moves, axes=1)[0] / step
+    )
+    height = camera_at(time).height
+    if velocity[1] >= MAX_ROW_RATE * height:
+        return splat
+    shear = np.linalg.inv(np.eye(2) - np.outer(velocity, [0, 1]) / height)
+    cov2d = shear @ splat.cov2d @ shear.T
+    return replace(splat, cov2d=cov2d, conics=np.linalg.inv(cov2d))
 
 
 def rolling_image(gaussians, camera_at, lens, degree, threshold_width) -> reference.RenderedImage:
-    """Each splat as a whole at the time of its mean, on black; camera_at: the camera at a time."""
-    cameras = [camera_at(row_time(camera_at, lens, mean)) for mean in gaussians.means]
+    """Each splat at the time of its mean, sheared, on black; camera_at: the camera at a time."""
+    times = [row_time(camera_at, lens, mean) for mean in gaussians.means]
+    cameras = [camera_at(time) for time, _ in times]
     pairs = [
         (reference.Gaussians(*(values[k : k + 1] for values in vars(gaussians).values())), camera)
         for k, camera in enumerate(cameras)
@@ -253,6 +285,10 @@ def rolling_image(gaussians, camera_at, lens, degree, threshold_width) -> refere
     bounds = lens.slope_bounds(cameras[0])  # wherever the camera is, and slow to compute
     with mock.patch.object(type(lens), "slope_bounds", lambda *_: bounds):
         splats = [effects.project(*pair, lens) for pair in pairs]
+        splats = [
+            as_read(splat, pair[0], camera_at, lens, time) if is_read and splat.visible else splat
+            for splat, pair, (time, is_read) in zip(splats, pairs, times, strict=True)
+        ]
     colors = np.concatenate([effects.sh_colors(*pair, lens, degree) for pair in pairs])
     arrays = ("means2d", "cov2d", "conics", "depths", "opacities", "visible")
     splats = reference.Projection(
