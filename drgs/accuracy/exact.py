@@ -55,7 +55,6 @@ from drgs.cameras.lens import Pinhole
 from drgs.config.approximations import PROJECTIONS
 from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
-from drgs.core.errors import UnsupportedError
 from drgs.core.types import Array2f, Array3f, Bool, Float
 from drgs.splatting.footprint import GaussianFalloff, MicroTileFootprint, Offsets, SamplePositions
 from drgs.splatting.grid import Lanes, TileGrid, load_pixels
@@ -80,6 +79,12 @@ _UNBOUNDED_OUTLINE = 1e-12  # 1 / px: U of an outline that holds every film
 MAX_EXPONENT = 1e4  # 2^-1e4 is 0 in either precision
 
 
+def is_still_pinhole(camera: Camera) -> bool:
+    """Return whether the splats of this module are those of the camera, or of ``lens_rays``."""
+    is_still = camera.shutter is None and camera.reading is None
+    return is_still and isinstance(camera.lens, Pinhole)
+
+
 def exact_shape(
     rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
 ) -> FilmShape:
@@ -88,6 +93,10 @@ def exact_shape(
     Its conic factor is U / a_c, and ``ray`` holds g / |a_c|, h, and 1 / |a_c|. Not differentiated:
     the position of the anchor, which does not change the result.
     """
+    if not is_still_pinhole(camera):
+        from drgs.accuracy.lens_rays import lens_shape
+
+        return lens_shape(rows, camera, position, low_pass)
     m0, m1, _ = film_axes(rows, camera, position, camera.lens.true_slopes(camera, position))
     film = factor_conic(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
     mean = dr.detach(film.means2d)
@@ -95,7 +104,8 @@ def exact_shape(
     slopes = list((anchor - camera.principal) / camera.focal)
     # Differentiated as the mean's distance from a point that stays.
     offset = (anchor - mean) - (film.means2d - mean)
-    (p, r, s), (kx, ky), h = _seen_along(rows, camera, position, slopes, low_pass)
+    along, (kx, ky), h = seen_along(rows, camera, position, slopes, low_pass)
+    p, r, s = along.conic_factor
     u, v = dr.fma(p, offset.x, r * offset.y), s * offset.y
     a = dr.fma(kx, u, dr.fma(ky, v, 1))
     denominator = dr.fma(a, a, h * dr.fma(u, u, v * v))
@@ -117,18 +127,18 @@ def ewa_with_depth(
     """Project as ``projection.ewa``, with the terms of the depth at a pixel: kappa (2) and h."""
     slopes = camera.lens.clamped_slopes(camera, position)
     film = ewa(rows, camera, position, low_pass)
-    _, kappa, h = _seen_along(rows, camera, position, slopes, low_pass)
+    _, kappa, h = seen_along(rows, camera, position, slopes, low_pass)
     return replace(film, ray=RayTerms(*kappa, h))
 
 
-def _seen_along(
+def seen_along(
     rows: GaussianRows,
     camera: Camera,
     position: Array3f,
     slopes: list[Float] | None,
     low_pass: Float | float,
-) -> tuple[Array3f, tuple[Float, Float], Float]:
-    """Return U, kappa and h of a Gaussian that is projected along the ray with the given slopes."""
+) -> tuple[FilmShape, tuple[Float, Float], Float]:
+    """Return shape, kappa and h of a Gaussian that is projected along a ray; slopes: the ray's."""
     m0, m1, n = film_axes(rows, camera, position, slopes)
     film = factor_conic(camera.lens.project_point(camera, position), [*m0], [*m1], low_pass)
     p, _, s = film.conic_factor
@@ -141,7 +151,43 @@ def _seen_along(
     m0 = p * m0
     h = dr.square(dr.dot(p * minors, n)) + low_pass_s * dr.squared_norm(dr.cross(m0, n))
     h += low_pass * dr.square(p) * (dr.squared_norm(minors_n) + low_pass_s * dr.squared_norm(n))
-    return film.conic_factor, (kx, ky), h
+    return film, (kx, ky), h
+
+
+@dataclass(frozen=True)
+class BoundingCone:
+    """The rays of a splat, as an ellipse of e: see the module's *Extent*."""
+
+    bounded: Bool  # the other numbers are finite, but mean something only there
+    depth: Float  # 1 - t h
+    q: Float
+    squared: Float  # g^2
+    v00: Float
+    v01: Float
+    v11: Float
+    center: tuple[Float, Float]
+
+    def edge(self, x: float, y: float) -> tuple[Float, Float]:
+        """Return e on the edge of the ellipse; x, y: a point of the unit circle."""
+        size = dr.sqrt(self.q / self.squared)
+        v = size * y / self.v11
+        return self.center[0] + (size * x - self.v01 * v) / self.v00, self.center[1] + v
+
+
+def bounding_cone(kx: Float, ky: Float, h: Float, reach: Float) -> BoundingCone:
+    """Return the rays along which rho^2 is at most ``reach``; kx, ky: kappa."""
+    depth = 1 - reach * h
+    bounded = depth > 1 - MAX_ECCENTRICITY
+    q = reach / dr.select(bounded, depth, 1)
+    squared = 1 - q * dr.fma(kx, kx, ky * ky)
+    # Written such that NaN is unbounded.
+    bounded = bounded & (squared > 1 - MAX_ECCENTRICITY)
+    squared = dr.select(bounded, squared, 1)
+    v00 = dr.sqrt(dr.select(bounded, 1 - q * kx * kx, 1))
+    v01, v11 = -q * kx * ky / v00, dr.sqrt(squared) / v00
+    shift = -q / squared
+    center = shift * kx, shift * ky
+    return BoundingCone(bounded, depth, q, squared, v00, v01, v11, center)
 
 
 @dataclass(frozen=True)
@@ -169,14 +215,13 @@ class RayFalloff(GaussianFalloff):
         return 9
 
     @override
-    def for_camera(self, camera: Camera) -> RayFalloff:
-        """Bind to a camera, whose film has the anchors; UnsupportedError unless it is a pinhole."""
-        if not isinstance(camera.lens, Pinhole):
-            raise UnsupportedError(
-                f"splats: projection 'exact' needs a pinhole, got {type(camera.lens).__name__}; "
-                "use 'unscented', or 'ewa', which is exact for parallel rays"
-            )
-        return RayFalloff(camera)
+    def for_camera(self, camera: Camera) -> GaussianFalloff:
+        """Bind to a camera, whose film has the anchors, or whose lens has the rays."""
+        if is_still_pinhole(camera):
+            return RayFalloff(camera)
+        from drgs.accuracy.lens_rays import LensRayFalloff
+
+        return LensRayFalloff(camera)
 
     @override
     def geometry(self, splats: Splats2D) -> list[Float]:
@@ -216,28 +261,20 @@ class RayFalloff(GaussianFalloff):
         kx = -sign * gx / p
         ky = -dr.fma(r, kx, sign * gy) / s
         p, r, s = p / at_mean, r / at_mean, s / at_mean
-        depth = 1 - reach * h
-        bounded = depth > 1 - MAX_ECCENTRICITY
-        q = reach / dr.select(bounded, depth, 1)
-        squared = 1 - q * dr.fma(kx, kx, ky * ky)
-        # Written such that NaN is unbounded.
-        bounded = bounded & (squared > 1 - MAX_ECCENTRICITY)
-        squared = dr.select(bounded, squared, 1)
-        v00 = dr.sqrt(dr.select(bounded, 1 - q * kx * kx, 1))
-        v01, v11 = -q * kx * ky / v00, dr.sqrt(squared) / v00
-        scale = dr.sqrt(depth * squared)
-        shift = -q / squared
+        cone = bounding_cone(kx, ky, h, reach)
+        scale = dr.sqrt(cone.depth * cone.squared)
+        shift = -cone.q / cone.squared
         shift_y = ky / s
         shift_x = (kx - r * shift_y) / p
         everywhere = [x, y, _UNBOUNDED_OUTLINE, 0, _UNBOUNDED_OUTLINE]
         ellipse = [
             x + shift * shift_x,
             y + shift * shift_y,
-            scale * v00 * p,
-            scale * dr.fma(v00, r, v01 * s),
-            scale * v11 * s,
+            scale * cone.v00 * p,
+            scale * dr.fma(cone.v00, r, cone.v01 * s),
+            scale * cone.v11 * s,
         ]
-        return [dr.select(bounded, a, b) for a, b in zip(ellipse, everywhere, strict=True)]
+        return [dr.select(cone.bounded, a, b) for a, b in zip(ellipse, everywhere, strict=True)]
 
     @override
     def footprint(
@@ -455,8 +492,12 @@ class RayDepths(AffineDepths):
     camera: Camera | None = None
 
     @override
-    def for_camera(self, camera: Camera) -> RayDepths:
-        return replace(self, camera=camera)
+    def for_camera(self, camera: Camera) -> AffineDepths:
+        if is_still_pinhole(camera):
+            return replace(self, camera=camera)
+        from drgs.accuracy.lens_rays import LensRayDepths
+
+        return LensRayDepths(self.bounds, camera=camera)
 
     @override
     def keys(self, splats: Splats2D) -> list[Float]:

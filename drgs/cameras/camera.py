@@ -15,7 +15,7 @@ import numpy as np
 
 from drgs.cameras.lens import PINHOLE, CameraParameters, Lens
 from drgs.core.arrays import types_of
-from drgs.core.types import Array2f, Array3f, Bool, Float, Scalar
+from drgs.core.types import Array2f, Array3f, Bool, Float, Matrix3f, Scalar
 
 MAX_RAY_ERROR_PX = 0.01  # px: largest distance of the point of a ray from the place of the ray
 
@@ -66,6 +66,10 @@ class Shutter(Protocol):
         """Return ``camera``, which is at time 0, at another time, without a shutter."""
         ...
 
+    def in_axes(self, rotation: Matrix3f) -> Shutter:
+        """Return the shutter of the same motion, seen in rotated axes."""
+        ...
+
     def cameras(self, camera: Camera, samples: int | None) -> list[Camera]:
         """Return the cameras whose images are averaged; samples: their number, None: its own."""
         return [camera]
@@ -73,6 +77,15 @@ class Shutter(Protocol):
     def camera_of(self, means: Array3f, camera: Camera) -> Camera:
         """Return the camera that sees each of some means (world)."""
         raise ValueError("a camera that motion blurs has an image for each of its cameras_in_time")
+
+
+@dataclass(frozen=True)
+class RowReading:
+    """The motion of a camera from time 0 to the row that it reads, and of points before it."""
+
+    velocity: Array3f  # camera axes, per time in which all rows are read
+    turn: Matrix3f  # from the camera's axes at time 0 to those at the row
+    travel: Array3f  # of the centre, in the axes at time 0
 
 
 @dataclass(frozen=True)
@@ -84,7 +97,7 @@ class Camera(CameraParameters):
     lens: Lens = PINHOLE
     aperture: Aperture | None = None  # of a lens that blurs
     shutter: Shutter | None = None  # of a camera that moves while it is open
-    velocity: Array3f | None = None  # camera axes, of points, per time in which it reads all rows
+    reading: RowReading | None = None  # of a camera at the row that it reads
 
     @staticmethod
     def create(

@@ -12,7 +12,7 @@ from typing import ClassVar
 import drjit as dr
 from typing_extensions import override
 
-from drgs.cameras.camera import Camera, Shutter
+from drgs.cameras.camera import Camera, RowReading, Shutter
 from drgs.core.arrays import types_of
 from drgs.core.types import Array3f, Bool, Float, Matrix3f, Scalar
 
@@ -56,6 +56,10 @@ class Motion(Shutter):
             shutter=None,
         )
 
+    @override
+    def in_axes(self, rotation: Matrix3f) -> Motion:
+        return replace(self, travel=rotation @ self.travel)
+
     def velocity(self, camera: Camera, offset: Array3f) -> Array3f:
         """Return the velocity of a point relative to the camera, camera axes, per unit of time.
 
@@ -94,7 +98,7 @@ class RollingShutter(Motion):
         The time is that of the row on which the mean is seen then, by Newton's method, of which the
         last step is differentiated (the implicit function theorem); before the first and after the
         last row, the motion goes on for :data:`MARGIN`. Other points of a splat are read at other
-        times: see ``drgs.effects.rolling_shutter``, which uses the ``velocity`` of the result.
+        times: see ``drgs.effects.rolling_shutter``, which uses the ``reading`` of the result.
         """
         still = dr.detach((means, camera))
         time = dr.full(type(means.x), 0.5, dr.width(means))
@@ -102,8 +106,11 @@ class RollingShutter(Motion):
             time, _ = self._step(*still, time)
             time = dr.clip(time, -MARGIN, 1 + MARGIN)
         moved, inside = self._step(means, camera, dr.detach(time))
-        at = self.pose(camera, dr.select(inside, moved, time))
-        return replace(at, velocity=dr.select(inside, self.velocity(at, means - at.center), 0))
+        time = dr.select(inside, moved, time)
+        at = self.pose(camera, time)
+        velocity = dr.select(inside, self.velocity(at, means - at.center), 0)
+        travel = camera.rotation @ (self.travel * time)
+        return replace(at, reading=RowReading(velocity, rotation_matrix(self.turn * time), travel))
 
     def _step(self, means: Array3f, camera: Camera, time: Float) -> tuple[Float, Bool]:
         """Take a step of Newton's method; return the time, and whether it is on the film."""

@@ -23,7 +23,8 @@ def with_effects(pipeline: Pipeline, gaussians: Gaussians, camera: Camera) -> Pi
 
         model = replace(pipeline.model, falloff=DimmedFalloff(pipeline.model.falloff))
         pipeline = replace(pipeline, shape=Defocused(pipeline.shape), model=model)
-    if camera.shutter is not None and camera.shutter.reads_rows:
+    reads_rows = camera.shutter is not None and camera.shutter.reads_rows
+    if reads_rows and not pipeline.model.for_camera(camera).falloff.follows_rays:
         from drgs.effects.rolling_shutter import Sheared
 
         pipeline = replace(pipeline, shape=Sheared(pipeline.shape))

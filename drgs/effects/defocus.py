@@ -8,6 +8,7 @@ splats far out of focus are as opaque as in focus. Partial occlusion at blurred 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -23,6 +24,7 @@ from drgs.splatting.footprint import (
     Offsets,
     SamplePositions,
 )
+from drgs.splatting.grid import Lanes
 from drgs.splatting.projection import FilmProjection, FilmShape, GaussianRows, Splats2D
 
 
@@ -56,6 +58,11 @@ class DimmedFalloff(GaussianFalloff):
 
     @property
     @override
+    def follows_rays(self) -> bool:
+        return self.falloff.follows_rays
+
+    @property
+    @override
     def num_geometry(self) -> int:
         return self.falloff.num_geometry + 1
 
@@ -67,6 +74,14 @@ class DimmedFalloff(GaussianFalloff):
     @override
     def for_camera(self, camera: Camera) -> DimmedFalloff:
         return replace(self, falloff=self.falloff.for_camera(camera))
+
+    @override
+    def bind(self, lanes: Lanes, positions: SamplePositions) -> DimmedFalloff:
+        return replace(self, falloff=self.falloff.bind(lanes, positions))
+
+    @override
+    def along(self, camera_tangents: Sequence[Float]) -> DimmedFalloff:
+        return replace(self, falloff=self.falloff.along(camera_tangents))
 
     @override
     def log2_opacity(self, geometry: list[Float]) -> Float:

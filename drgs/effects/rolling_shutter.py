@@ -31,11 +31,11 @@ class Sheared:
     ) -> FilmShape:
         """Return the sheared shape; the opacity is that of the still splat."""
         film = self.shape(rows, camera, position, low_pass)
-        assert camera.velocity is not None, "as RollingShutter.camera_of makes it"
+        assert camera.reading is not None, "as RollingShutter.camera_of makes it"
         slopes = camera.lens.clamped_slopes(camera, position)
         jacobian = camera.lens.projection_jacobian(camera.in_own_axes(), position, slopes)
         height = camera.film_end.y - camera.film_start.y
-        drift, rate = (dr.dot(row, camera.velocity) / height for row in jacobian)
+        drift, rate = (dr.dot(row, camera.reading.velocity) / height for row in jacobian)
         can_be_read = rate < MAX_ROW_RATE
         drift, rate = dr.select(can_be_read, drift, 0), dr.select(can_be_read, rate, 0)
         p, r, s = film.conic_factor

@@ -41,7 +41,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import inf, isfinite
-from typing import Literal, TypeVar
+from types import SimpleNamespace
+from typing import Literal, TypeVar, cast
 
 import numpy as np
 import pydantic
@@ -193,6 +194,54 @@ def render(
         transmittance[place] = behind.reshape(block_shape)
         near_threshold[place] = marks.reshape(block_shape)
     return RenderedImage(image, 1 - transmittance, depth, transmittance, near_threshold)
+
+
+def render_along(
+    gaussians: Gaussians,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    colors: np.ndarray,
+    widening: np.ndarray | float = 0.0,
+    centers: np.ndarray | None = None,
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    model: ImageModel = DEFAULT_MODEL,
+    threshold_width: float = reference.THRESHOLD_WIDTH,
+) -> RenderedImage:
+    """Return the image along given rays, which may be those of any lens and of any motion.
+
+    A Gaussian's response to a ray is that of its peak along it, ``ImageModel.projection`` exact.
+
+    origins, directions: (H, W, 3) world, depth grows by 1 along a direction; NaN: no ray. colors:
+    (N, 3), display space. widening: (N, 3, 3) added to the covariances, world. centers: (N,) depths
+    of the means, by which splats are sorted; None: by the depths of their peaks.
+
+    With W W^T = S^-1, m = W^T (mean - origin), v = W^T direction: the peak is at t = m . v / |v|^2,
+    and rho^2 = |m x v|^2 / |v|^2.
+    """
+    height, width, _ = origins.shape
+    rotations = reference.quat_to_rotation(gaussians.quats)
+    if np.any(widening):
+        axes = rotations * np.exp(gaussians.log_scales)[:, None]
+        total = axes @ np.swapaxes(axes, 1, 2) + widening
+        whitening = np.linalg.inv(np.linalg.cholesky(total))
+    else:
+        scales = np.exp(gaussians.log_scales)[:, :, None]
+        whitening = np.swapaxes(rotations, 1, 2) / scales
+    offsets = gaussians.means - origins.reshape(-1, 1, 3)
+    m = np.einsum("nij,pnj->pni", whitening, offsets)
+    v = np.einsum("nij,pj->pni", whitening, np.nan_to_num(directions).reshape(-1, 3))
+    squared = np.maximum(np.sum(v**2, axis=-1), 1e-300)
+    t = np.sum(m * v, axis=-1) / squared
+    rho_sq = np.sum(np.cross(m, v) ** 2, axis=-1) / squared
+    keys = t if centers is None else np.broadcast_to(centers, t.shape)
+    peaks = _Peaks(rho_sq, keys, keys, t)
+    opacities = reference.sigmoid(gaussians.logit_opacities)
+    splats = cast(_Splats, SimpleNamespace(opacities=opacities))
+    weights, behind, marks = _composite(splats, peaks, np.zeros(len(t)), model, threshold_width)
+    image = (weights @ colors + behind[:, None] * background).reshape(height, width, 3)
+    depth = np.sum(weights * keys, axis=1).reshape(height, width)
+    behind = behind.reshape(height, width)
+    return RenderedImage(image, 1 - behind, depth, behind, marks.reshape(height, width))
 
 
 def _colors_along(splats: _Splats, rays: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ the 3DGS paper; others are in separate modules, imported when they are chosen:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
@@ -218,6 +218,11 @@ class GaussianFalloff:
     """
 
     @property
+    def follows_rays(self) -> bool:
+        """Whether alpha is that of each pixel's ray, also while the camera moves."""
+        return False
+
+    @property
     def num_geometry(self) -> int:
         """Numbers of a splat."""
         return 6
@@ -230,6 +235,19 @@ class GaussianFalloff:
     def for_camera(self, camera: Camera) -> GaussianFalloff:
         """Return this falloff for one camera; here, it is independent of the camera."""
         del camera
+        return self
+
+    def bind(self, lanes: Lanes, positions: SamplePositions) -> GaussianFalloff:
+        """Return the falloff for one kernel's lanes; here, it does not depend on the pixel."""
+        del lanes, positions
+        return self
+
+    def along(self, camera_tangents: Sequence[Float]) -> GaussianFalloff:
+        """Return the falloff whose :meth:`tangent` includes that of the camera's rays.
+
+        camera_tangents: of ``camera.numbers()``. Here, alpha depends on splats alone.
+        """
+        del camera_tangents
         return self
 
     def geometry(self, splats: Splats2D) -> list[Float]:
@@ -455,7 +473,12 @@ class ImageModel:
     def bind(self, lanes: Lanes, grid: TileGrid) -> ImageModel:
         """Return this model for the lanes of one kernel, with inputs loaded before the loop."""
         positions = self.positions.bind(lanes, grid)
-        return replace(self, positions=positions, features=self.features.bind(lanes, positions))
+        return replace(
+            self,
+            falloff=self.falloff.bind(lanes, positions),
+            positions=positions,
+            features=self.features.bind(lanes, positions),
+        )
 
     def footprint(
         self, geometry: list[Float], lanes: Lanes, active: Bool | bool

@@ -24,7 +24,9 @@ from support.lens_scenes import (
     gaussians_at_points,
     kernel_lens,
     point_beyond_lens_limit,
+    points_at,
     rolling_image,
+    row_time,
     seen_points,
 )
 
@@ -124,6 +126,62 @@ def by_rows(case, values, lens=PINHOLE):
     camera_at = partial(effects.camera_at, camera, close_camera(camera))
     gaussians = reference.Gaussians(**values)
     return planes_of(rolling_image(gaussians, camera_at, lens, case.degree, NEAR_THRESHOLD))
+
+
+def by_lens_rays(case, values, lens=PINHOLE):
+    """The peaks along each pixel's ray, at its row's time if the shutter rolls."""
+    first, gaussians = reference_camera(case), reference.Gaussians(**values)
+    last = first if case.shutter is None else close_camera(first)
+    camera_at = partial(effects.camera_at, first, last)
+    y = np.arange(case.height) + 0.5
+    rows = [lens_rays(lens, camera_at(each / case.height), each) for each in y]
+    times = [row_time(camera_at, lens, mean)[0] for mean in gaussians.means]
+    if case.shutter is None:
+        times = [0.0] * case.count
+    each = [splat_of(lens, camera_at(time), gaussians, k) for k, time in enumerate(times)]
+    kept = np.array([splat is not None for splat in each])
+    splats = [splat for splat in each if splat is not None]
+    colors, widening, depths = map(np.array, zip(*splats, strict=True))
+    given = {k: v for k, v in case.approximations.items() if k in MODEL_FIELDS}
+    model = rays.ImageModel(**given)
+    shown = reference.Gaussians(*(array[kept] for array in vars(gaussians).values()))
+    by_center = model.order == "center"
+    centers = depths if by_center else None
+    image = rays.render_along(
+        shown, *map(np.array, zip(*rows, strict=True)), colors, widening * model.low_pass, centers,
+        model=model, threshold_width=NEAR_THRESHOLD,
+    )  # fmt: skip
+    planes, marked = planes_of(image)
+    return planes if by_center else planes[:4], marked
+
+
+def lens_rays(lens, camera, y) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions (W, 3), world, of a row of pixels; a depth of 1 along each."""
+    film = np.column_stack([np.arange(camera.width) + 0.5, np.full(camera.width, y)])
+    points = points_at(lens, camera, film, np.ones(len(film)))
+    starts = points * [1, 1, 0] if isinstance(lens, effects.Orthographic) else 0 * points
+    # Not the transpose: a rotation rounded to single precision is orthogonal to 1e-7.
+    to_world = np.linalg.inv(camera.rotation).T
+    return starts @ to_world + camera.center, (points - starts) @ to_world
+
+
+def splat_of(lens, camera, gaussians, k) -> tuple | None:
+    """Colour, the covariance (3, 3) that a low-pass of 1 px^2 adds, and depth; None: not seen.
+
+    The low-pass widens parallel to the film: with the derivatives x, y of the place and n of the
+    depth, it is B B^T, [x y n]^T B = [e_x e_y].
+    """
+    one = reference.Gaussians(*(array[k : k + 1] for array in vars(gaussians).values()))
+    point = (one.means - camera.center) @ camera.rotation.T
+    if not lens.is_seen(camera, point)[0]:
+        return None
+    jacobian = effects.jacobians(lens, camera, point)[0]
+    depth = lens.depths(camera, point)
+    by_z = not isinstance(lens, (effects.Fisheye, effects.Equirectangular))
+    toward = np.array([0, 0, 1 / depth[0]]) if by_z else point[0] / depth**2
+    added = np.linalg.inv(np.vstack([jacobian, toward]) @ camera.rotation)[:, :2]
+    colors = effects.sh_colors(one, camera, lens, one.sh_degree)
+    return colors[0], added @ added.T, depth[0]
 
 
 # ----------------------------------------------------------------------------------------------
@@ -317,6 +375,19 @@ EFFECTS = {
     "smoothing": (by_effects, {"smoothing": 0.0625}),
     "motion blur": (by_motion, {"shutter": shutter(MotionBlur, MOTION_SAMPLES)}),
     "rolling shutter": (by_rows, {"shutter": shutter(RollingShutter), "count": 20}),
+    "along rays": (by_lens_rays, {"approximations": {"projection": "exact"}}),
+    "along rays, ordered": (
+        by_lens_rays,
+        {"approximations": {"projection": "exact", "order": "pixel", "order_window": 8}},
+    ),
+    "along rays, rolling shutter": (
+        by_lens_rays,
+        {
+            "shutter": shutter(RollingShutter),
+            "count": 20,
+            "approximations": {"projection": "exact"},
+        },
+    ),
     **{name: (None, {"approximations": APPROXIMATIONS[name], **STEP}) for name in OF_LENSES},
 }
 
