@@ -37,6 +37,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import drjit as dr
 from typing_extensions import override
@@ -68,7 +69,7 @@ from drgs.splatting.projection import (
     factor_conic,
 )
 
-NUM_OUTLINE_RAYS = 8
+NUM_OUTLINE_POINTS = 8
 MAX_OUTLINE_DEVIATION = (
     4.0  # of the farthest ray from the nearest; more bent outlines are unbounded
 )
@@ -197,7 +198,7 @@ class LensRayFalloff(GaussianFalloff):
             dr.enable_grad(numbers)
             dr.set_grad(numbers, list(self.camera_tangents))
             moved = tuple(PixelRay.through(camera, x, y) for x, y in points)
-            dr.forward_to(moved, flags=dr.ADFlag.ClearEdges)
+            dr.forward_to(moved, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
             tangents = dr.grad(moved)
         return replace(self, rays=rays, ray_tangents=tangents)
 
@@ -233,47 +234,24 @@ class LensRayFalloff(GaussianFalloff):
     @override
     def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
         """Return centre x, y, p, r, s of an ellipse |U d|^2 <= ``reach`` that holds the splat."""
-        x, y, p, r, s = geometry[:5]
-        t, splat = types_of(type(x)), _SplatRows.unpack(geometry)
-        (kx, ky), h = splat.kappa, splat.h
-        cone = bounding_cone(kx, ky, h, reach)
-        jx, jy, n = splat.jacobian[0], splat.jacobian[1], splat.depth
-        toward_x, toward_y, mean = dr.cross(jy, n), dr.cross(n, jx), dr.cross(jx, jy)
-        per_determinant = 1 / dr.dot(jx, toward_x)
-        lens, place = self.camera.lens, t.Array2f(x, y)
-        offsets, bounded = [], cone.bounded
-        for k in range(NUM_OUTLINE_RAYS):
-            angle = 2 * math.pi * k / NUM_OUTLINE_RAYS
-            u, v = cone.edge(math.cos(angle), math.sin(angle))
-            dy = v / s
-            dx = (u - r * dy) / p
-            direction = (mean + dx * toward_x + dy * toward_y) * per_determinant
-            a = 1 - dr.fma(kx, u, ky * v)
-            peak = direction * (a / dr.fma(a, a, h * dr.fma(u, u, v * v)))
-            at, point = self._where_read(peak, splat.origin)
-            seen, point, _ = lens.visibility(replace(at, near=type(x)(0)), point)
-            offset = lens.offset(at, place, lens.project_point(at, point))
-            offsets.append(offset)
+        x, y = geometry[:2]
+        t, splat, lens = types_of(type(x)), _SplatRows.unpack(geometry), self.camera.lens
+        contour = splat.cylinder if lens.parallel else splat.cone
+        points, bounded = contour(reach, NUM_OUTLINE_POINTS)
+        place, offsets = t.Array2f(x, y), []
+        for point in points:
+            at, position = self._where_read(point, splat.origin)
+            seen, position, _ = lens.visibility(replace(at, near=type(x)(0)), position)
+            offsets.append(lens.offset(at, place, lens.project_point(at, position)))
             bounded &= seen
         if (period := lens.period(self.camera)) is not None:
             for offset in offsets:
                 bounded &= dr.abs(offset.x) < period / 4
         offsets = [dr.select(bounded, offset, 0) for offset in offsets]
-        middle = sum(offsets[1:], offsets[0]) / NUM_OUTLINE_RAYS
-        scale = math.sqrt(2 / NUM_OUTLINE_RAYS)
-        columns = [scale * (offset - middle) for offset in offsets]
-        ellipse = factor_conic(
-            place, [c.x for c in columns], [c.y for c in columns], MIN_OUTLINE_VARIANCE
-        )
-        p, r, s = ellipse.conic_factor
-        radii = [dr.norm(t.Array2f(dr.fma(p, c.x, r * c.y), s * c.y)) / scale for c in columns]
-        least, largest = radii[0], radii[0]
-        for radius in radii[1:]:
-            least, largest = dr.minimum(least, radius), dr.maximum(largest, radius)
-        bounded &= largest < MAX_OUTLINE_DEVIATION * (least + OUTLINE_MARGIN)
-        size = dr.sqrt(reach) / (OUTLINE_MARGIN + largest + (largest - least) / 2)
-        found = [x + middle.x, y + middle.y, size * p, size * r, size * s]
+        center, factor, is_ellipse = _ellipse_around(offsets)
+        found = [*(place + center), *(dr.sqrt(reach) * factor)]
         everywhere = [x, y, _UNBOUNDED_OUTLINE, 0, _UNBOUNDED_OUTLINE]
+        bounded &= is_ellipse
         return [dr.select(bounded, a, b) for a, b in zip(found, everywhere, strict=True)]
 
     def _where_read(self, peak: Array3f, origin: Array3f | None) -> tuple[Camera, Array3f]:
@@ -449,6 +427,36 @@ class _SplatRows:
         a = n - kx * e1 - ky * e2
         return _SplatRows((p, r, s), (jx, jy), n, (kx, ky), h, origin, e1, e2, a)
 
+    def cone(self, reach: Float, count: int) -> tuple[list[Array3f], Bool]:
+        """Return peaks along ``count`` rays with |e|^2 = ``reach`` D, and if there are such rays.
+
+        They are relative to the splat's origin.
+        """
+        (kx, ky), h = self.kappa, self.h
+        cone, peaks = bounding_cone(kx, ky, h, reach), []
+        for x, y in _circle(count):
+            u, v = cone.edge(x, y)
+            a = 1 - dr.fma(kx, u, ky * v)
+            peaks.append(self._point(u, v) * (a / dr.fma(a, a, h * dr.fma(u, u, v * v))))
+        return peaks, cone.bounded
+
+    def cylinder(self, reach: Float, count: int) -> tuple[list[Array3f], Bool | bool]:
+        """Return the same for parallel rays, whose peaks are at 1 + kappa . e times the depth."""
+        (kx, ky), size = self.kappa, dr.sqrt(reach)
+        mean, peaks = self._point(type(size)(0), type(size)(0)), []
+        for x, y in _circle(count):
+            u, v = size * x, size * y
+            peaks.append(self._point(u, v) + dr.fma(kx, u, ky * v) * mean)
+        return peaks, True
+
+    def _point(self, u: Float, v: Float) -> Array3f:
+        """Return the point of the plane n . x = 1 with the coordinates e = (u, v)."""
+        (p, r, s), (jx, jy), n = self.factor, self.jacobian, self.depth
+        across = dr.cross(jy, n)
+        y = v / s
+        x = (u - r * y) / p
+        return (dr.cross(jx, jy) + x * across + y * dr.cross(n, jx)) / dr.dot(jx, across)
+
     def crossing(self, ray: PixelRay) -> tuple:
         """Return numerator and denominator of the peak's t, those of f, and e, a, o', b, o."""
         e1, e2 = dr.dot(self.e1, ray.direction), dr.dot(self.e2, ray.direction)
@@ -491,6 +499,32 @@ class _SplatRows:
             origin,
         )
         return e1, e2, log2_alpha, along, *derivatives
+
+
+def _circle(count: int) -> list[tuple[float, float]]:
+    angles = [2 * math.pi * k / count for k in range(count)]
+    return [(math.cos(angle), math.sin(angle)) for angle in angles]
+
+
+def _ellipse_around(points: Sequence[Array2f]) -> tuple[Array2f, Array3f, Bool]:
+    """Return centre and conic factor (p, r, s) of an ellipse around a closed curve, and if it fits.
+
+    points: of the curve. It is enlarged by half of what the points deviate from it.
+    """
+    t, count = types_of(type(points[0].x)), len(points)
+    center = sum(points[1:], points[0]) / count
+    # Of an ellipse's points, evenly distributed, |U d|^2 is 1.
+    columns = [math.sqrt(2 / count) * (point - center) for point in points]
+    across, down = [c.x for c in columns], [c.y for c in columns]
+    p, r, s = factor_conic(center, across, down, MIN_OUTLINE_VARIANCE).conic_factor
+    radii = [
+        math.sqrt(count / 2) * dr.norm(t.Array2f(dr.fma(p, x, r * y), s * y))
+        for x, y in zip(across, down, strict=True)
+    ]
+    least, largest = reduce(dr.minimum, radii), reduce(dr.maximum, radii)
+    scale = 1 / (OUTLINE_MARGIN + largest + (largest - least) / 2)
+    fits = largest < MAX_OUTLINE_DEVIATION * (least + OUTLINE_MARGIN)
+    return center, t.Array3f(p, r, s) * scale, fits
 
 
 @dataclass(frozen=True)

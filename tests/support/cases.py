@@ -378,7 +378,7 @@ EFFECTS = {
     "along rays": (by_lens_rays, {"approximations": {"projection": "exact"}}),
     "along rays, ordered": (
         by_lens_rays,
-        {"approximations": {"projection": "exact", "order": "pixel", "order_window": 8}},
+        {"approximations": {"projection": "exact", "order": "pixel", "order_window": 12}},
     ),
     "along rays, rolling shutter": (
         by_lens_rays,
