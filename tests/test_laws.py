@@ -31,6 +31,7 @@ from support.views import tensors
 
 import drgs
 from drgs.accuracy import pipeline
+from drgs.accuracy.lens_rays import LensRayFalloff
 from drgs.cameras.camera import Aperture, Camera
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.lens import LENSES
@@ -275,6 +276,7 @@ factor_conic, short, compensated = (
     projection.factor_conic, footprint.exp2_short, projection.compensated_opacity
 )  # fmt: skip
 derivatives, tangent = GaussianFalloff.derivatives, GaussianFalloff.tangent
+of_rays = LensRayFalloff.derivatives
 moments, runs = GaussianFalloff.moments, itertools.count()
 numbers, variance, cameras = Camera.numbers, Aperture.variance, MotionBlur.cameras
 seen_at, camera_of = Fisheye.project_point, RollingShutter.camera_of
@@ -303,6 +305,14 @@ BROKEN = {
     "an exponential that is too short": (
         *("no effect, pinhole", single_precision_is_accurate, footprint, "exp2_short"),
         lambda x: 1.001 * short(x),
+    ),
+    "a derivative along rays of 1.01": (
+        *("along rays, fisheye", gradients_equal_differences, LensRayFalloff, "derivatives"),
+        lambda *a: [1.01 * d for d in of_rays(*a)],
+    ),
+    "rays that stay where the lens changes": (
+        *("along rays, fisheye", camera_gradients_equal_differences, LensRayFalloff, "along"),
+        lambda falloff, tangents: falloff,
     ),
     # Features
     "an aperture one percent too large": (

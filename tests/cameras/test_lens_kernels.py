@@ -153,12 +153,3 @@ def test_invisible_positions_affect_no_other_gaussian(precision, name, projectio
         assert not gradients[n][where].any()
         np.testing.assert_array_equal(gradients[n], gradient)
         assert gradient.any()
-
-
-@pytest.mark.parametrize("name", ["rational", "orthographic"])
-def test_exact_projection_refuses_lenses_other_than_pinholes(name):
-    case = with_lens(name, approximations={"projection": "exact"}, count=5)
-    kind = type(case.lens).__name__
-    message = f"^splats: projection 'exact' needs a pinhole, got {kind}"
-    with pytest.raises(ValueError, match=message):
-        case.planes(case.values)

@@ -152,7 +152,19 @@ def by_lens_rays(case, values, lens=PINHOLE):
         model=model, threshold_width=NEAR_THRESHOLD,
     )  # fmt: skip
     planes, marked = planes_of(image)
+    marked = marked | at_end_of_lens(lens, first)
     return planes if by_center else planes[:4], marked
+
+
+def at_end_of_lens(lens, camera) -> np.ndarray:
+    """Pixels (H * W,) of which the lens shows a place nearby, or not all: kernels take 0.01 px."""
+    film = reference.pixel_centers(camera.width, camera.height).reshape(-1, 2)
+    outward = (film - camera.principal) / np.linalg.norm(film - camera.principal, axis=1)[:, None]
+    nearer, farther = (
+        np.isnan(points_at(lens, camera, film + step * outward, np.ones(len(film)))).any(axis=1)
+        for step in (-0.02, 0.02)
+    )
+    return nearer != farther
 
 
 def lens_rays(lens, camera, y) -> tuple[np.ndarray, np.ndarray]:
@@ -392,8 +404,14 @@ EFFECTS = {
 }
 
 NO_SENSOR = "in focus by z in kernels, by distance in the reference; no sensor has both"
+FEWER_TERMS = "rational, or fisheye, without some terms"
 HOLES = {
     ("thin lens", "orthographic"): "parallel rays meet in no aperture",
+    **{
+        (effect, name): FEWER_TERMS
+        for effect in ("along rays", "along rays, ordered", "along rays, rolling shutter")
+        for name in ("radial", "tangential", "fox", "plain fisheye")
+    },
     **{
         ("thin lens", name): NO_SENSOR
         for name in ("plain fisheye", "fisheye", "thin prism", "panorama")
@@ -451,6 +469,17 @@ CASES = [
         if (effect, lens) not in HOLES
     ),
     with_lens("rational", "edges", by_effects, scene=edges),
+    *(
+        with_lens(
+            name, f"along rays, {scene.__name__}", by_lens_rays,
+            scene=partial(scene, ALL_LENSES[name]), approximations={"projection": "exact"},
+        )
+        for scene in (large_behind, edges_behind)
+        for name in ("rational", "fisheye", "thin prism")
+    ),
+    Case("along rays, needles", reference=by_lens_rays, scene=needles, width=40, height=23,
+         focal=20.0, count=8, shutter=shutter(RollingShutter),
+         approximations={"projection": "exact"}),
     *(
         Case(f"{name}, pinhole", approximations=options, reference=by_rays)
         for name, options in APPROXIMATIONS.items()
