@@ -1,4 +1,4 @@
-"""``python -m drgs.bench accuracy SCENE``: error and time of each approximation.
+"""Measure the error and the time of each approximation, on a fit and on a stress scene.
 
 Compares renderings of a trained and a stress scene (wide lens, large splats near the camera,
 interpenetrating layers) with the most accurate form: the float64 numpy reference that evaluates
@@ -14,14 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
 import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
-
 from drgs.accuracy.error_budget import Search
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.bench.output import (
-    add_out,
     count_operations,
     machine,
     markdown_table,
@@ -30,7 +29,7 @@ from drgs.bench.output import (
 )
 from drgs.bench.scenes import bench_camera, device_camera, stress_scene
 from drgs.cameras.camera import Camera
-from drgs.cli.commands import CommandParser
+from drgs.cli.ending import exit_on_user_error
 from drgs.config.approximations import Approximations
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
@@ -123,10 +122,9 @@ class AccuracyMeasurement:
         return 10 ** (-self.psnr / 20)
 
 
-def add_arguments(parser: CommandParser) -> None:
-    """Add the arguments of the command."""
-    parser.show_examples("%(prog)s out/lego")
-    add_out(parser, run, "accuracy.csv", *PLOTS)
+def main() -> None:
+    """Entry point of the command."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     add_scene(parser)
     parser.add_argument("--views", type=int, default=3, help="test views of a fit (default: 3)")
     parser.add_argument(
@@ -137,9 +135,13 @@ def add_arguments(parser: CommandParser) -> None:
         help=f"error budgets, see drgs render (default: {' '.join(map(str, BUDGETS))})",
     )
     parser.add_argument("--quick", action="store_true", help="one view, fewer rounds")
+    parser.add_argument("--out", type=Path, default=Path("out/studies/accuracy"), metavar="DIR")
+    args = parser.parse_args()
+    with exit_on_user_error():
+        run(args)
 
 
-def add_scene(parser: CommandParser) -> None:
+def add_scene(parser: argparse.ArgumentParser) -> None:
     """Add the argument that :func:`load_subject` reads."""
     parser.add_argument(
         "scene",
@@ -151,7 +153,8 @@ def add_scene(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure both scenes; write table, CSV and plots."""
+    """Measure both scenes; print tables, write CSV and plots."""
+    args.out.mkdir(parents=True, exist_ok=True)
     subjects = [
         load_subject(Path(args.scene), 1 if args.quick else args.views),
         Subject("stress", *stress_scene(FILM_SIZE_PX), (0.0, 0.0, 0.0)),
@@ -406,3 +409,7 @@ def plot(results: Sequence[AccuracyMeasurement]) -> Figure:
             else:
                 names.append(name)
     return figure
+
+
+if __name__ == "__main__":
+    main()
