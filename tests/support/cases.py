@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from drgs.cameras.motion import MotionBlur, RollingShutter
 from drgs.core.arrays import types_of
-from drgs.reference import effects, rays
+from drgs.reference import lenses, rays
 from drgs.reference import splatting as reference
 from drgs.testing import Case, Values, adjoint_is_transpose, bytes_are_reproducible, single
-from support import helpers
+from support import helpers, reference_effects
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import (
     FOCAL,
@@ -29,7 +29,7 @@ from support.lens_scenes import (
 )
 
 MOTION_SAMPLES = 3
-PINHOLE = effects.Pinhole()
+PINHOLE = lenses.Pinhole()
 
 
 # ----------------------------------------------------------------------------------------------
@@ -65,10 +65,10 @@ def by_effects(case, values, lens=PINHOLE):
     gaussians = reference.Gaussians(**values)
     if case.smoothing is not None:
         gaussians = smoothed_reference(gaussians, np.full(case.count, case.smoothing))
-    defocus = case.aperture and effects.ThinLens(*case.aperture)
+    defocus = case.aperture and lenses.ThinLens(*case.aperture)
     antialiased = case.approximations.get("antialiased", False)
     return planes_of(
-        effects.render(
+        lenses.render(
             gaussians, reference_camera(case), lens, np.zeros(3), antialiased,
             defocus, case.degree, NEAR_THRESHOLD,
         )
@@ -82,7 +82,7 @@ def rates_of(smoothing) -> np.ndarray:
 
 def smoothed_reference(gaussians: reference.Gaussians, smoothing) -> reference.Gaussians:
     """Gaussians whose parameters hold the filter."""
-    scales, opacities = effects.smoothing_filter(
+    scales, opacities = reference_effects.smoothing_filter(
         gaussians.log_scales, gaussians.logit_opacities, rates_of(smoothing)
     )
     logits = np.log(opacities) - np.log1p(-opacities)
@@ -111,7 +111,7 @@ def shutter(kind, *arguments, travel=TRAVEL, turn=TURN):
 def by_motion(case, values, lens=PINHOLE):
     camera = reference_camera(case)
     return planes_of(
-        effects.render_motion_blur(
+        reference_effects.render_motion_blur(
             reference.Gaussians(**values), camera, close_camera(camera), MOTION_SAMPLES,
             np.zeros(3), lens, NEAR_THRESHOLD,
         )
@@ -121,7 +121,7 @@ def by_motion(case, values, lens=PINHOLE):
 def by_rows(case, values, lens=PINHOLE):
     """A rolling shutter: each splat as a whole at the time when the row of its mean is read."""
     camera = reference_camera(case)
-    camera_at = partial(effects.camera_at, camera, close_camera(camera))
+    camera_at = partial(reference_effects.camera_at, camera, close_camera(camera))
     gaussians = reference.Gaussians(**values)
     return planes_of(rolling_image(gaussians, camera_at, lens, case.degree, NEAR_THRESHOLD))
 
@@ -270,7 +270,7 @@ def with_lens(name, effect="lens", reference_of=by_effects, **options) -> Case:
     """A case with a lens of the reference and of the kernels."""
     lens = ALL_LENSES[name]
     options.setdefault("focal", FOCAL.get(type(lens), 26.0))
-    if isinstance(lens, effects.Equirectangular):
+    if isinstance(lens, lenses.Equirectangular):
         options.setdefault("scene", all_around)
     if (effect, name) == ("rolling shutter", "panorama"):
         reference_of = None  # a mean may be in several rows: which one shows it is open
