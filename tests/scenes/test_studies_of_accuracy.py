@@ -9,20 +9,17 @@ from itertools import pairwise
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import REPOSITORY
 from PIL import Image
 from support import small_capture
 from support.helpers import reference_gaussians
+from support.studies import load_study
 
 from drgs.bench.scenes import bench_camera, bench_gaussians
 from drgs.core.errors import UserError
 from drgs.reference import rays as reference_rays
 from drgs.results import metrics
 
-with pytest.MonkeyPatch.context() as patch:
-    patch.syspath_prepend(REPOSITORY / "scenes" / "studies")
-    import accuracy
-    import stability
+accuracy, stability = map(load_study, ("accuracy", "stability"))
 
 
 @pytest.fixture
