@@ -1,4 +1,4 @@
-"""The reference of lenses and of defocus: where splats lie, how large, and seen along what.
+"""The reference of lenses: where splats lie, how large, and seen along what.
 
 It imports nothing of this package but ``reference``, and is to be read after it. A lens replaces
 ``project`` and ``sh_colors`` of ``reference.render``.
@@ -54,9 +54,6 @@ by the eighth power of (step / distance to the nearest pole), and by rounding / 
 
 CENTRAL_WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 """Central differences of order 8: f'(x) h = sum_j w_j (f(x + j h) - f(x - j h)), j = 1 to 4."""
-
-MIN_CUT = 2.0**-60
-"""An alpha that changes no sum: the cut of splats however dim they are out of focus."""
 
 
 # ---- Lenses ----------------------------------------------------------------------------------
@@ -468,49 +465,23 @@ def _first_positive_root(coefficients: ArrayLike) -> float:
 # ---- Projection ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class ThinLens:
-    """An aperture, a disc about the camera's centre, and the plane that is in focus."""
-
-    aperture_radius: float  # world units, >= 0
-    focus_distance: float  # world units, > 0: camera z of what is in focus
-
-    def blur_radii(self, camera: Camera, depths: np.ndarray) -> np.ndarray:
-        """Return (N, 2), px: half axes of the ellipse over which a point at depth (N,) is spread.
-
-        Seen from the aperture's point a, the point (x, z) is at f (x - a) / z on the film, moved
-        by f a / focus_distance so that the plane in focus stays where it is: together it moves by
-        f a (1 / focus_distance - 1 / z).
-        """
-        spread = self.aperture_radius * np.abs(1 / self.focus_distance - 1 / depths)
-        return camera.focal * spread[:, None]
-
-
 def project(
     gaussians: Gaussians,
     camera: Camera,
     lens: Lens = Pinhole(),
     antialiased: bool = False,
-    low_pass: float = reference.LOW_PASS,
-    defocus: ThinLens | None = None,
+    low_pass: ArrayLike = reference.LOW_PASS,
 ) -> Projection:
     """Return the splats that Gaussians leave on the film behind a lens.
 
-    cov2d = J W Sigma W^T J^T + low_pass I + diag(r^2 / 4)    (EWA, section 4)
+    cov2d = J W Sigma W^T J^T + diag(low_pass)    (EWA, section 4)
 
     J is the derivative of ``film_points`` at the mean, its slope clamped where the lens has
-    ``slope_bounds``. low_pass: px^2; antialiased: opacities are multiplied by
-    sqrt(det(J W Sigma W^T J^T) / det(cov2d without r)), as in ``reference.project``.
-
-    defocus: r (N, 2) px are its ``blur_radii``; the variance of a uniform disc of radius r along
-    an axis is r^2 / 4. Opacities are multiplied by sqrt(det(cov2d without r) / det(cov2d)), so
-    that the integral over the film of a splat stays. So are ``Projection.cuts``: a splat that is
-    seen in focus is seen out of focus, and ends at as many standard deviations. Both may be small,
-    but not below MIN_CUT. ``Projection.depths`` are the lens's.
+    ``slope_bounds``. low_pass: px^2, one number or (N, 2); antialiased: opacities are multiplied by
+    sqrt(det(J W Sigma W^T J^T) / det(cov2d)), as in ``reference.project``. ``Projection.depths``
+    are the lens's.
 
     Splats with a singular cov2d, which low_pass = 0 permits, are not visible.
-
-    Defocus is not defined behind an orthographic lens, whose rays meet in no aperture.
     """
     points = (gaussians.means - camera.center) @ camera.rotation.T
     depths = lens.depths(camera, points)
@@ -520,29 +491,18 @@ def project(
     scales = np.exp(gaussians.log_scales)
     axes = camera.rotation @ reference.quat_to_rotation(gaussians.quats) * scales[:, None, :]
     axes2d = jacobians(lens, camera, _points_of_jacobian(lens, camera, points)) @ axes
-    widening = np.full((len(points), 2), low_pass)
-    cov2d, dets, areas = reference.widened_covariances(axes2d, widening)
+    cov2d, dets, areas = reference.widened_covariances(axes2d, low_pass)
     singular = dets == 0
     opacities = reference.sigmoid(gaussians.logit_opacities)
     if antialiased:
         opacities = opacities * areas / np.sqrt(np.where(singular, 1.0, dets))
-    above_cut, cuts = opacities > reference.ALPHA_CUT, reference.ALPHA_CUT
-    if defocus is not None:
-        radii = defocus.blur_radii(camera, np.where(seen, depths, 1.0))
-        dets_in_focus = dets
-        cov2d, dets, _ = reference.widened_covariances(axes2d, widening + radii**2 / 4)
-        singular = dets == 0
-        dimming = np.sqrt(dets_in_focus / np.where(singular, 1.0, dets))
-        opacities, cuts = opacities * dimming, np.maximum(cuts * dimming, MIN_CUT)
-        above_cut &= opacities > MIN_CUT
     return Projection(
         means2d=lens.film_points(camera, points),
         cov2d=cov2d,
         conics=reference._inverses(cov2d, np.where(singular, 1.0, dets)),
         depths=depths,
         opacities=opacities,
-        visible=seen & ~singular & above_cut,
-        cuts=cuts,
+        visible=seen & ~singular & (opacities > reference.ALPHA_CUT),
     )
 
 
@@ -603,44 +563,17 @@ def render(
     lens: Lens = Pinhole(),
     background: ArrayLike = (0.0, 0.0, 0.0),
     antialiased: bool = False,
-    defocus: ThinLens | None = None,
     degree: int | None = None,
     threshold_width: float = reference.THRESHOLD_WIDTH,
 ) -> RenderedImage:
     """Return the image of Gaussians behind a lens; its depth sums the lens's ``depths``.
 
-    background: (3,) display space; antialiased, defocus: see ``project``; degree: see
-    ``sh_colors``; threshold_width: see ``reference.composite``.
+    background: (3,) display space; antialiased: see ``project``; degree: see ``sh_colors``;
+    threshold_width: see ``reference.composite``.
     """
-    splats = project(gaussians, camera, lens, antialiased, defocus=defocus)
+    splats = project(gaussians, camera, lens, antialiased)
     colors = sh_colors(gaussians, camera, lens, degree)
     size = camera.width, camera.height
     return reference.composite(
         splats, colors, background, *size, threshold_width, lens.period(camera)
     )
-
-
-def lens_cameras(camera: Camera, defocus: ThinLens, num_samples: int) -> list[Camera]:
-    """Return pinhole cameras at points of the aperture that agree on the plane in focus.
-
-    The camera's centre moves by (a_x, a_y) to the right and down, its principal point by
-    f a / focus_distance.
-    """
-    right, down, _ = camera.rotation
-    return [
-        replace(
-            camera,
-            center=camera.center + a_x * right + a_y * down,
-            cx=camera.cx + camera.fx * a_x / defocus.focus_distance,
-            cy=camera.cy + camera.fy * a_y / defocus.focus_distance,
-        )
-        for a_x, a_y in defocus.aperture_radius * _disc_points(num_samples)
-    ]
-
-
-def _disc_points(count: int) -> np.ndarray:
-    """Return (count, 2): a sunflower, each seed with an equal share of the unit disc's area."""
-    k = np.arange(count)
-    radii = np.sqrt((k + 0.5) / count)
-    angles = k * pi * (3 - sqrt(5))
-    return radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])

@@ -30,7 +30,6 @@ from support.views import (
 from support.wall_scenes import to_display
 
 import drgs  # noqa: F401  (registers the plugins)
-from drgs.reference import lenses
 from drgs.reference import splatting as reference
 
 CAMERAS = {
@@ -158,7 +157,7 @@ def test_a_background_texture_is_stretched_over_the_film_upright(view, srgb_prim
 
 def test_defocused_environment_is_the_mean_of_pinholes_in_the_aperture():
     """The pinholes' principal points agree on the plane in focus."""
-    lens = lenses.ThinLens(0.25, 1.25)
+    lens = reference_effects.ThinLens(0.25, 1.25)
     aperture = {"aperture_radius": 0.25, "focus_distance": 1.25}
     sensor = VIEW.with_sensor("thinlens", fov=55.0, **aperture)
     image = image_before(EMITTERS["envmap"](), sensor, is_hidden=True)
@@ -168,7 +167,7 @@ def test_defocused_environment_is_the_mean_of_pinholes_in_the_aperture():
         np.eye(3), np.zeros(3), focal, focal, width / 2, height / 2, width, height
     )
     images = []
-    for camera in lenses.lens_cameras(plain, lens, 16):
+    for camera in reference_effects.lens_cameras(plain, lens, 16):
         pinhole = calibrated(fx=focal, fy=focal, cx=camera.cx, cy=camera.cy)
         images.append(image_before(EMITTERS["envmap"](), pinhole, is_hidden=True))
     np.testing.assert_allclose(image, np.mean(images, axis=0), atol=IMAGE)

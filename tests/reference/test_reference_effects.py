@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from support import reference_effects
+from support.reference_effects import ThinLens
 from support.reference_lenses import FISHEYE, THIN_PRISM, camera_at_origin, gaussians_at
 from support.reference_scenes import BACKGROUND, assert_images_agree, rotation_about, small_scene
 
@@ -23,7 +24,6 @@ from drgs.reference.lenses import (
     OpenCV,
     Orthographic,
     Pinhole,
-    ThinLens,
     ThinPrismFisheye,
 )
 from drgs.reference.splatting import Camera
@@ -184,7 +184,7 @@ def test_a_singular_splat_is_not_visible():
 def test_invisible_splats_have_finite_values(lens):
     means = np.array([[0, 0, 0], [0, 0, -1], [1, 2, 0], [3, 0, 0.011], [0, 0, 2.0], [1e3, 0, 1]])
     with np.errstate(all="raise"):
-        splats = lenses.project(gaussians_at(means), camera_at_origin(), lens, defocus=None)
+        splats = lenses.project(gaussians_at(means), camera_at_origin(), lens)
     for field in fields(splats):
         assert np.isfinite(getattr(splats, field.name)).all(), field.name
     assert splats.visible[4] and not splats.visible[0]
@@ -231,11 +231,12 @@ def test_defocused_moments_match_many_pinholes(depth):
     mean = camera.rotation.T @ [0.1, -0.2, depth] + camera.center
     gaussians = gaussians_at(mean, [[0.02, 0.03, 0.01]], quats=[0.3, 0.8, -0.5, 0.1])
     lens_splats = [
-        reference.project(gaussians, c) for c in lenses.lens_cameras(camera, defocus, 1000)
+        reference.project(gaussians, c)
+        for c in reference_effects.lens_cameras(camera, defocus, 1000)
     ]
     means2d = np.array([s.means2d[0] for s in lens_splats])
     cov2d = np.mean([s.cov2d[0] for s in lens_splats], axis=0) + np.cov(means2d.T, bias=True)
-    splats = lenses.project(gaussians, camera, defocus=defocus)
+    splats = reference_effects.project_defocused(gaussians, camera, defocus)
     # The sunflower's moments are a disc's to about 1e-3, and J differs between the pinholes by
     # the aperture's angle squared, 0.01 at depth 1. Measured: 1e-3.
     np.testing.assert_allclose(means2d.mean(axis=0), splats.means2d[0], atol=2e-2)

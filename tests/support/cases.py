@@ -65,14 +65,13 @@ def by_effects(case, values, lens=PINHOLE):
     gaussians = reference.Gaussians(**values)
     if case.smoothing is not None:
         gaussians = smoothed_reference(gaussians, np.full(case.count, case.smoothing))
-    defocus = case.aperture and lenses.ThinLens(*case.aperture)
-    antialiased = case.approximations.get("antialiased", False)
-    return planes_of(
-        lenses.render(
-            gaussians, reference_camera(case), lens, np.zeros(3), antialiased,
-            defocus, case.degree, NEAR_THRESHOLD,
-        )
-    )  # fmt: skip
+    camera, antialiased = reference_camera(case), case.approximations.get("antialiased", False)
+    settings = lens, antialiased, case.degree, NEAR_THRESHOLD
+    if case.aperture is not None:
+        defocus = reference_effects.ThinLens(*case.aperture)
+        return planes_of(reference_effects.render_defocused(gaussians, camera, defocus, *settings))
+    lens, *others = settings
+    return planes_of(lenses.render(gaussians, camera, lens, np.zeros(3), *others))
 
 
 def rates_of(smoothing) -> np.ndarray:

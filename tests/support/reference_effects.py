@@ -1,4 +1,4 @@
-"""The reference of effects: moving cameras, the 3D smoothing filter, surfaces between splats.
+"""The reference of effects: defocus, moving cameras, the smoothing filter, surfaces between splats.
 
 Naive float64 numpy, to be read after ``drgs.reference``, whose spaces, units and orders these are.
 So are its sources, with Shoemake, "Animating Rotation with Quaternion Curves", SIGGRAPH 1985.
@@ -8,23 +8,128 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf
+from math import inf, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from drgs.reference import lenses
 from drgs.reference import splatting as reference
 from drgs.reference.lenses import Lens, Pinhole, render
-from drgs.reference.splatting import Camera, Gaussians, RenderedImage
+from drgs.reference.splatting import Camera, Gaussians, Projection, RenderedImage
 
 PINHOLE = Pinhole()
+
+MIN_CUT = 2.0**-60
+"""An alpha that changes no sum: the cut of splats however dim they are out of focus."""
 
 SMOOTHING_VARIANCE = 0.2
 """px^2: variance of the 3D smoothing filter at the largest sampling rate (Mip-Splatting's s)."""
 
 VIEW_MARGIN = 0.15
 """A camera samples what lies within its film, widened by this part of its size (Mip-Splatting)."""
+
+
+# ---- Defocus ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ThinLens:
+    """An aperture, a disc about the camera's centre, and the plane that is in focus."""
+
+    aperture_radius: float  # world units, >= 0
+    focus_distance: float  # world units, > 0: camera z of what is in focus
+
+    def blur_radii(self, camera: Camera, depths: np.ndarray) -> np.ndarray:
+        """Return (N, 2), px: half axes of the ellipse over which a point at depth (N,) is spread.
+
+        Seen from the aperture's point a, the point (x, z) is at f (x - a) / z on the film, moved
+        by f a / focus_distance so that the plane in focus stays where it is: together it moves by
+        f a (1 / focus_distance - 1 / z).
+        """
+        spread = self.aperture_radius * np.abs(1 / self.focus_distance - 1 / depths)
+        return camera.focal * spread[:, None]
+
+
+def project_defocused(
+    gaussians: Gaussians,
+    camera: Camera,
+    defocus: ThinLens,
+    lens: Lens = PINHOLE,
+    antialiased: bool = False,
+    low_pass: float = reference.LOW_PASS,
+) -> Projection:
+    """Return the splats that Gaussians leave on the film behind a lens with an aperture.
+
+        cov2d = cov2d in focus + diag(r^2 / 4)
+
+    r (N, 2) px are the ``blur_radii``; the variance of a uniform disc of radius r along an axis is
+    r^2 / 4. Opacities are multiplied by sqrt(det(cov2d in focus) / det(cov2d)), so that the
+    integral over the film of a splat stays. So are ``Projection.cuts``: a splat that is seen in
+    focus is seen out of focus, and ends at as many standard deviations. Both may be small, but not
+    below MIN_CUT.
+
+    Not defined behind an orthographic lens, whose rays meet in no aperture.
+    """
+    focused = lenses.project(gaussians, camera, lens, antialiased, low_pass)
+    radii = defocus.blur_radii(camera, np.where(focused.visible, focused.depths, 1.0))
+    blurred = lenses.project(gaussians, camera, lens, low_pass=low_pass + radii**2 / 4)
+    dimming = np.sqrt(_determinants(focused) / _determinants(blurred))
+    opacities = focused.opacities * dimming
+    return replace(
+        blurred,
+        opacities=opacities,
+        visible=focused.visible & (opacities > MIN_CUT),
+        cuts=np.maximum(focused.all_cuts * dimming, MIN_CUT),
+    )
+
+
+def _determinants(splats: Projection) -> np.ndarray:
+    """Return the determinants (N,) of cov2d, which do not cancel in the conics."""
+    return splats.cov2d[:, 0, 0] / np.where(splats.visible, splats.conics[:, 1, 1], 1.0)
+
+
+def render_defocused(
+    gaussians: Gaussians,
+    camera: Camera,
+    defocus: ThinLens,
+    lens: Lens = PINHOLE,
+    antialiased: bool = False,
+    degree: int | None = None,
+    threshold_width: float = reference.THRESHOLD_WIDTH,
+) -> RenderedImage:
+    """Return the image over black, as ``lenses.render``."""
+    splats = project_defocused(gaussians, camera, defocus, lens, antialiased)
+    colors = lenses.sh_colors(gaussians, camera, lens, degree)
+    size, period = (camera.width, camera.height), lens.period(camera)
+    return reference.composite(splats, colors, np.zeros(3), *size, threshold_width, period)
+
+
+def lens_cameras(camera: Camera, defocus: ThinLens, num_samples: int) -> list[Camera]:
+    """Return pinhole cameras at points of the aperture that agree on the plane in focus.
+
+    The camera's centre moves by (a_x, a_y) to the right and down, its principal point by
+    f a / focus_distance.
+    """
+    right, down, _ = camera.rotation
+    return [
+        replace(
+            camera,
+            center=camera.center + a_x * right + a_y * down,
+            cx=camera.cx + camera.fx * a_x / defocus.focus_distance,
+            cy=camera.cy + camera.fy * a_y / defocus.focus_distance,
+        )
+        for a_x, a_y in defocus.aperture_radius * _disc_points(num_samples)
+    ]
+
+
+def _disc_points(count: int) -> np.ndarray:
+    """Return (count, 2): a sunflower, each seed with an equal share of the unit disc's area."""
+    k = np.arange(count)
+    radii = np.sqrt((k + 0.5) / count)
+    angles = k * pi * (3 - sqrt(5))
+    return radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
 # ---- Cameras that move while they expose -----------------------------------------------------
