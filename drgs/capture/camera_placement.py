@@ -97,13 +97,13 @@ def _around_settings(
     middle = np.mean(bounding_box(scene), axis=0, dtype=np.float64)
     ahead = [(o.pose[:3, 3], -o.pose[:3, 2]) for o in sensors]
     aims = [c + ((middle - c) @ axis) * axis for c, axis in ahead if (middle - c) @ axis > 0]
+    up = _up_axis(sensors)
     if not aims or given & {"fov", "distance"}:
-        return {"up": _up_axis(sensors)}
+        return {"up": up}
     target = np.mean(aims, axis=0) if settings.target is None else np.array(settings.target)
     distance = float(np.median([np.linalg.norm(o.pose[:3, 3] - target) for o in sensors]))
     fov = _fov(settings, float(np.median([o.narrower_fov for o in sensors])))
-    where = {"target": tuple(target.tolist()), "distance": distance, "fov": fov}
-    return where | {"up": _up_axis(sensors)}
+    return {"up": up, "target": tuple(target.tolist()), "distance": distance, "fov": fov}
 
 
 def _sensor_settings(sensors: list[SceneSensor]) -> dict[str, object]:
