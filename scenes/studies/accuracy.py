@@ -154,11 +154,11 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Measure both scenes; print tables, write CSV and plots."""
-    args.out.mkdir(parents=True, exist_ok=True)
     subjects = [
         load_subject(Path(args.scene), 1 if args.quick else args.views),
         Subject("stress", *stress_scene(FILM_SIZE_PX), (0.0, 0.0, 0.0)),
     ]
+    args.out.mkdir(parents=True, exist_ok=True)
     print(f"{machine()}")
     results = []
     for subject in subjects:
