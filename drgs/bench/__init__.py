@@ -1,4 +1,5 @@
 """Measure drgs; write tables and plots.
 
-Each measurement shown in the documents is a command, ``drgs bench NAME``.
+A measurement that users make on their own machine is a command, ``drgs bench NAME``; one that was
+made once is a script in ``scenes/studies``.
 """

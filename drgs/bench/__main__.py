@@ -8,8 +8,6 @@ from drgs.cli.commands import CommandParser, Subcommand, run_command
 
 COMMANDS = {
     "speed": "times of drgs and of other renderers on the same scene, in one run",
-    "accuracy": "error of each approximation against the time that it saves",
-    "stability": "error of float32 against float64 as scenes become harder",
 }  # descriptions by module
 
 
@@ -21,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def add_arguments(parser: CommandParser) -> None:
     """Add the measurements."""
     parser.description = "Measure drgs; write tables and plots."
-    parser.show_examples("%(prog)s speed --quick", "%(prog)s accuracy out/lego --out out/bench")
+    parser.show_examples("%(prog)s speed --quick")
     commands = {name: Subcommand(text, f"drgs.bench.{name}") for name, text in COMMANDS.items()}
     parser.add_commands(commands, metavar="MEASUREMENT")
 

@@ -1,8 +1,8 @@
 """``python -m drgs.capture SCENE --out DIR``: turn a Mitsuba scene into a training set.
 
 SCENE is an XML file, or a Python file with a function ``scene()`` that returns a scene dictionary.
-Its images are path traced, not by its own integrator, from cameras around it, inside it if it is a
-room, or at its own sensors if it has many. They are written in the NeRF-synthetic layout: see
+Its images are path traced, not by its own integrator, from cameras around it, or at its own sensors
+if it has many. They are written in the NeRF-synthetic layout: see
 ``drgs.capture.dataset``. A second run of the same command continues an interrupted one.
 """
 
@@ -81,14 +81,14 @@ def _add_cameras(parser: CommandParser) -> None:
     add(
         "--cameras",
         choices=KINDS,
-        help="where they stand (default: inside a room; where the scene's sensors are, if there "
-        f"are {ENOUGH_SENSORS} or more; else around it)",
+        help="where they stand (default: where the scene's sensors are, if there are "
+        f"{ENOUGH_SENSORS} or more; else around it)",
     )
     add(
         "--fov",
         type=degrees,
         metavar="DEGREES",
-        help="horizontal field of view (default: the original's 39.6; in a room 70)",
+        help="horizontal field of view (default: the original's 39.6)",
     )
     add(
         "--distance",
@@ -115,7 +115,7 @@ def _add_cameras(parser: CommandParser) -> None:
         help="degrees about the up axis, from the axis that follows it in x, y, z, x (default: "
         "all around)",
     )
-    add("--elevation", **ranges, help="degrees above the horizon (default: 0 90; in a room -60 60)")
+    add("--elevation", **ranges, help="degrees above the horizon (default: 0 90)")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -155,12 +155,8 @@ def _given_settings(args: argparse.Namespace) -> dict[str, object]:
 def _describe_cameras(settings: CaptureSettings, count: int) -> str:
     if settings.cameras == "sensors":
         return f"cameras: the scene's own sensors, {count}"
-    where = "around the scene"
-    if settings.cameras == "inside":
-        assert settings.target is not None, "settings_for sets it"
-        target = ", ".join(f"{value:.4g}" for value in settings.target)
-        where = f"inside the scene, around ({target})"
-    return f"cameras: {count} {where}, field of view {math.degrees(settings.fov):.4g} degrees"
+    fov = math.degrees(settings.fov)
+    return f"cameras: {count} around the scene, field of view {fov:.4g} degrees"
 
 
 if __name__ == "__main__":

@@ -46,10 +46,8 @@ NUM_FIRST = 10  # images after which a warning is printed if most are empty or b
 MIN_COVERED_PART = 0.01  # of an image that is not empty
 
 REMEDIES = {
-    "around": "give --cameras inside for a room, or --azimuth, --elevation, --target and "
-    "--distance",
-    "inside": "give --target, or --cameras around",
-    "sensors": "give --cameras around or inside",
+    "around": "give --azimuth, --elevation, --target and --distance",
+    "sensors": "give --cameras around",
 }
 """Remedies for empty images, by kind of cameras."""
 
@@ -185,7 +183,7 @@ class CaptureFolder:
             rows, columns = np.divmod(pixels, settings.size[0])
             spots = np.stack([columns, rows], axis=1) + rng.uniform(size=(len(pixels), 2))
             rays = view.pose[:3, 3], view_rays(view, spots, settings)
-            hits, valid = first_hits(scene, *rays, settings.hides_lights)
+            hits, valid = first_hits(scene, *rays)
             positions.append(hits[valid][:share])
             colors.append(to_uint8(image[pixels[valid], :3])[:share])
         return np.concatenate(positions), np.concatenate(colors)

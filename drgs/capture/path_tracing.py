@@ -1,6 +1,6 @@
 """Path traced images of a Mitsuba scene.
 
-From around a scene, lights themselves are hidden. Alpha is the part of a pixel that surfaces cover
+Lights themselves are hidden. Alpha is the part of a pixel that surfaces cover
 (an opacity mask counts, glass is opaque); the colour is the mean colour c of that part, as both
 channels of the film's premultiplied linear image (a c, a) come from the same samples. The colour is
 encoded first and composited then, a srgb(c) + (1 - a) background, as in Blender's images of
@@ -70,7 +70,7 @@ class CaptureSettings:
     seed: int = 0
     cameras: str = "around"  # one of drgs.capture.camera_placement.KINDS
     azimuth: tuple[float, float] | None = None  # degrees about up; None: all around
-    elevation: tuple[float, float] | None = None  # degrees; None: as the kind of cameras has it
+    elevation: tuple[float, float] | None = None  # degrees; None: 0 to 90
 
     def __post_init__(self) -> None:
         width, height = self.size
@@ -93,11 +93,6 @@ class CaptureSettings:
         """The smaller one of the horizontal and the vertical field of view, radians."""
         width, height = self.size
         return scale_fov(self.fov, min(1.0, height / width))
-
-    @property
-    def hides_lights(self) -> bool:
-        """True if shining surfaces are left out: not the lamps of a room."""
-        return self.cameras != "inside"
 
     def count(self, split: str) -> int:
         """Return the number of views of a split."""
@@ -223,10 +218,8 @@ class CaptureCamera:
         self._scene, self._settings = scene, settings
         low, high = bounding_box(scene)
         diagonal = float(np.linalg.norm(high - low))
-        depth, hides = settings.max_depth, settings.hides_lights
-        self._integrator = mi.load_dict(
-            {"type": "path", "max_depth": depth, "hide_emitters": hides}
-        )
+        depth = settings.max_depth
+        self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
         self._sensor = mi.load_dict(
             {
                 "type": "perspective",
@@ -300,7 +293,7 @@ def require_sight(scene: mi.Scene, settings: CaptureSettings, views: list[Captur
     spots = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * settings.size
     for view in views:
         rays = view.pose[:3, 3], view_rays(view, spots, settings)
-        if view.split == "train" and first_hits(scene, *rays, settings.hides_lights)[1].any():
+        if view.split == "train" and first_hits(scene, *rays)[1].any():
             return
     raise UserError("the cameras see nothing of the scene: give --target and --distance")
 
@@ -316,14 +309,17 @@ def view_rays(view: CaptureView, spots: np.ndarray, settings: CaptureSettings) -
 
 
 def first_hits(
-    scene: mi.Scene, origin: np.ndarray, directions: np.ndarray, ignores_lamps: bool
+    scene: mi.Scene, origin: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where rays meet a surface, (N, 3) float32 world, and whether they do, (N,) bool."""
+    """Return where rays meet a surface, (N, 3) float32 world, and whether they do, (N,) bool.
+
+    Rays pass surfaces that shine.
+    """
     ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(directions.T))
 
     def intersect(ray: mi.Ray3f) -> tuple[mi.SurfaceInteraction3f, Bool]:
         hit = scene.ray_intersect(ray)
-        return hit, hit.is_valid() & hit.shape.is_emitter() & ignores_lamps
+        return hit, hit.is_valid() & hit.shape.is_emitter()
 
     hit, lamp = intersect(ray)
     for _ in range(MAX_LAMPS_IN_A_ROW - 1):

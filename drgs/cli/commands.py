@@ -89,8 +89,9 @@ class CommandParser(argparse.ArgumentParser):
         name = next((word for word in words if not word.startswith("-")), None)
         if self._subcommands and name is not None and name not in self._subcommands:
             *others, last = self._subcommands
+            known = f"{', '.join(others)} and {last}" if others else last
             nearest = did_you_mean(name, self._subcommands, cutoff=0.5)
-            self.error(f"there is no command {name}, only {', '.join(others)} and {last}{nearest}")
+            self.error(f"there is no command {name}, only {known}{nearest}")
         return super().parse_known_args(words, namespace or argparse.Namespace())
 
     @override

@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,7 +29,7 @@ from drgs.datasets.folders import config_for
 from drgs.fit.budget import Budget, parse_duration
 from drgs.fit.fit_folder import FitFolder
 from drgs.fit.session import FitSession
-from drgs.results.folder import CONFIG, EVENTS, load_moved_config
+from drgs.results.folder import CONFIG, load_moved_config
 from drgs.training.parallel.communicator import Communicator
 
 if TYPE_CHECKING:  # imported with --view
@@ -104,11 +104,6 @@ def _add_viewing(parser: CommandParser) -> None:
         metavar="N",
         help="port of the page (default: first free port from 8080)",
     )
-    group.add_argument(
-        "--tensorboard",
-        action="store_true",
-        help="also write the history for TensorBoard (extra: tensorboard)",
-    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -124,14 +119,12 @@ def run(args: argparse.Namespace) -> None:
             session.run()
             return
         server = blocks.enter_context(page_server(args))
-        if args.tensorboard:
-            require_module("tensorboardX", "tensorboard", "--tensorboard")
         session.config, out = read_inputs(args)
         session.folder = FitFolder(out, args.command, args.resume is not None, args.overwrite)
         if args.config is not None and args.config.is_dir():
             choose_effects(session, session.config, session.folder)
         session.uses_terminal = True
-        session.on_start = partial(add_observers, args, server, blocks)
+        session.on_start = partial(add_live_view, server)
         finished = session.run()
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")
@@ -164,16 +157,8 @@ def communicator(args: argparse.Namespace) -> Communicator:
     return comm
 
 
-def add_observers(
-    args: argparse.Namespace, server: LocalServer | None, blocks: ExitStack, session: FitSession
-) -> None:
-    """Add observers for TensorBoard and the server's page; blocks: closed with the command."""
-    if args.tensorboard:
-        from drgs.fit.event_log import EventLog
-
-        assert session.folder is not None, "the command has an output folder"
-        log = EventLog(session.folder.path / EVENTS, session.history)
-        session.observers.append(blocks.enter_context(closing(log)))
+def add_live_view(server: LocalServer | None, session: FitSession) -> None:
+    """Add an observer for the server's page, if there is one."""
     if server is not None:
         from drgs.fit.live_view import watch
         from drgs.live_page.server import url

@@ -40,8 +40,6 @@ SIDE_BY_SIDE = "side_by_side"  # the same, with the photograph and the differenc
 VIEWS = "views.json"  # the dataset's cameras of the training views, for orbits
 EXAMINATION = "examination.json"  # which effects an examination chose, with the evidence
 BUDGET_PLAN = "plan.txt"  # the plan for a budget of time, with reasons
-TENSORBOARD = "tensorboard"  # a folder, with ``--tensorboard``
-EVENTS = f"{TENSORBOARD}/events.out.tfevents.fit"  # TensorBoard finds the word in the middle
 METRICS = "metrics.json"  # written last
 ERROR_BUDGET = "error_budget.json"  # of ``drgs render --error``
 
@@ -51,12 +49,12 @@ def result_names() -> list[str]:
     names = [name for effect in EFFECTS.all() for name in effect.value.files]
     names += [CHECKPOINT, CURVES, DENSITY, EXAMINATION, HISTORY, METRICS, ORBIT, ORBIT_GIF]
     names += [BUDGET_PLAN, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, RENDERS, REPORT, SIDE_BY_SIDE]
-    return [*names, TENSORBOARD, VIEWER, VIEWS]
+    return [*names, VIEWER, VIEWS]
 
 
 COMMAND = "fit"
 MAX_CONFIG_BYTES = 1 << 28
-FOLDERS = (RENDERS, SIDE_BY_SIDE, TENSORBOARD)  # results that are folders
+FOLDERS = (RENDERS, SIDE_BY_SIDE)  # results that are folders
 
 SECTIONS = {"data", "init", "model", "optimizer", "loss", "densify", "output", "iterations", "seed"}
 """Keys of every ``config.yml`` that a fit has written."""
@@ -293,7 +291,7 @@ def _files(folder: Path) -> Iterator[str]:
 
 def _file_names(images: Sequence[str]) -> list[str]:
     """Return the files that a fit writes, except ``config.yml``, whose content is checked."""
-    return [*(name for name in result_names() if name not in FOLDERS), EVENTS, *images]
+    return [*(name for name in result_names() if name not in FOLDERS), *images]
 
 
 def _visible_names(folder: Path) -> list[str]:

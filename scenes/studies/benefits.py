@@ -151,9 +151,7 @@ def depth_of(scene: mi.Scene, view: View) -> np.ndarray:
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     local = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], axis=-1)
     rotation = view.camera_to_world[:3, :3]
-    hits, valid = first_hits(
-        scene, view.center, local.reshape(-1, 3) @ rotation.T, ignores_lamps=True
-    )
+    hits, valid = first_hits(scene, view.center, local.reshape(-1, 3) @ rotation.T)
     depths = (hits - view.center) @ rotation[:, 2]
     return np.where(valid, depths, 0).reshape(view.height, view.width).astype(np.float32)
 

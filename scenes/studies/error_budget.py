@@ -6,7 +6,7 @@ and almost no cut-offs. The oracle has the errors of all combinations at some of
 takes the cheapest one that is within the budget in 95 % of them.
 
 Scenes: the shipped truck; fits and files that the command line names; a dense scene, needles, and a
-wide lens (``drgs.bench.scenes``).
+wide lens (``accuracy.py``).
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ import drgs
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from accuracy import stress_scene
 from drgs.accuracy import error_budget as budgets
 from drgs.bench.output import machine, markdown_table
-from drgs.bench.scenes import bench_gaussians, device_camera, stress_scene
+from drgs.bench.scenes import bench_gaussians, device_camera
 from drgs.cameras.camera import Camera
 from drgs.cameras.orbits import orbit_of_gaussians
 from drgs.cameras.viewpoints import FIELD_OF_VIEW

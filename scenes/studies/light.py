@@ -21,7 +21,7 @@ import drgs  # noqa: F401  (registers the integrator)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from drgs.bench.accuracy import add_scene
+from accuracy import add_scene
 from drgs.bench.output import machine, markdown_table
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure

@@ -21,7 +21,7 @@ from pathlib import Path
 import drgs  # noqa: F401  (registers the integrator)
 import mitsuba as mi
 import numpy as np
-from drgs.bench.accuracy import Subject, add_scene, load_subject
+from accuracy import Subject, add_scene, load_subject
 from drgs.bench.output import markdown_table
 from drgs.bench.scenes import mitsuba_sensor
 from drgs.bench.speed import SHELL_STDS, volprim_scene

@@ -12,10 +12,11 @@ from PIL import Image
 from support.commands import assert_refused
 from support.render_command import run, sensor, write_scene
 from support.small_capture import pose_around
+from support.studies import load_study
 from support.views import Scene, tensors
 
 from drgs.accuracy import error_budget as budgets
-from drgs.bench.scenes import device_camera, stress_scene
+from drgs.bench.scenes import device_camera
 from drgs.cameras.lens import LENSES
 from drgs.cameras.viewpoints import OPENCV_TO_MITSUBA
 from drgs.config.approximations import FALLOFFS, Approximations, parse_error
@@ -40,7 +41,7 @@ SHIPPED = Approximations()
 @pytest.fixture(scope="module")
 def scene():
     """Gaussians seen through a wide lens, and cameras beside each other."""
-    gaussians, (camera,) = stress_scene(SIZE)
+    gaussians, (camera,) = load_study("accuracy").stress_scene(SIZE)
     rng = np.random.default_rng(0)
     moved = [replace(camera, center=rng.normal(0, 0.15, 3)) for _ in range(12)]
     return gaussians, moved

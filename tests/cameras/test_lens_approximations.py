@@ -25,9 +25,9 @@ from support.reference_lenses import gaussians_at, whitened_samples
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.accuracy.unscented import unscented_shape
 from drgs.config.approximations import Approximations
-from drgs.reference import effects
+from drgs.reference import lenses
 from drgs.reference import splatting as reference
-from drgs.reference.effects import Orthographic
+from drgs.reference.lenses import Orthographic
 from drgs.splatting import rendering
 
 
@@ -88,7 +88,7 @@ def test_colours_use_the_directions_of_pixel_rays(name):
     case = with_lens(name, width=12, height=9, focal=focal, **options)
     gaussians, camera = reference.Gaussians(**case.values), reference_camera(case)
     color = case.planes(case.values)[1:4].T
-    splats = effects.project(gaussians, camera, lens)
+    splats = lenses.project(gaussians, camera, lens)
     expected = np.zeros((case.height * case.width, 3))
     directions_of = direction_of_pixels(lens, camera)
     coefficients = np.concatenate([gaussians.sh0, gaussians.shN], axis=1)

@@ -14,9 +14,9 @@ from support.lens_scenes import FORMS, LENSES, kernel_lens, lens_camera
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
-from drgs.reference import effects
-from drgs.reference.effects import OpenCV
-from drgs.reference.effects import ThinPrismFisheye as ThinPrism
+from drgs.reference import lenses as reference
+from drgs.reference.lenses import OpenCV, Pinhole
+from drgs.reference.lenses import ThinPrismFisheye as ThinPrism
 
 # ----------------------------------------------------------------------------------------------
 # Missing coefficients
@@ -62,7 +62,11 @@ def limit_of(lens) -> float:
 @pytest.mark.parametrize(
     ("lens", "is_limited_by_tilt"),
     [
-        *((lens, None) for lens in LENSES.values() if isinstance(lens, (OpenCV, effects.Fisheye))),
+        *(
+            (lens, None)
+            for lens in LENSES.values()
+            if isinstance(lens, (OpenCV, reference.Fisheye))
+        ),
         (OpenCV(p1=0.125, p2=-0.0625), True),
         # Limited by the radial factor's derivative along the slope, then by the factor across it.
         (OpenCV(k1=-0.25, k2=0.03125, k4=0.0625, p1=-0.03125, p2=0.015625), True),
@@ -99,7 +103,7 @@ def kernels_behind(lens) -> dict[str, list]:
 @pytest.mark.parametrize(
     "lenses",
     [
-        [effects.Pinhole(), LENSES["radial"], LENSES["rational"]],
+        [Pinhole(), LENSES["radial"], LENSES["rational"]],
         [LENSES["plain fisheye"], LENSES["fisheye"], WITHOUT_PRISM, LENSES["thin prism"]],
     ],
     ids=["slopes", "angles"],

@@ -24,9 +24,9 @@ from drgs.cameras import distortion, fisheye
 from drgs.cameras.fisheye import Fisheye as CameraFisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye as CameraThinPrismFisheye
-from drgs.reference import effects
+from drgs.reference import lenses
 from drgs.reference import splatting as reference
-from drgs.reference.effects import Fisheye, OpenCV, ThinPrismFisheye
+from drgs.reference.lenses import Fisheye, OpenCV, ThinPrismFisheye
 
 # ----------------------------------------------------------------------------------------------
 # Visibility
@@ -55,7 +55,7 @@ def test_fisheye_sees_from_the_axis_to_behind_the_camera(precision, name):
     quats = np.random.default_rng(1).normal(size=(len(points), 4))
     gaussians = replace(gaussians_at(points, [[0.1, 0.2, 0.05]]), quats=single(quats))
     gaussians = replace(gaussians, log_scales=single(gaussians.log_scales))
-    expected = effects.project(gaussians, camera, lens)
+    expected = lenses.project(gaussians, camera, lens)
     splats = splats_of(gaussians, camera, lens, precision)
     assert np.array(splats.visible).all() and expected.visible.all()
     tolerance = SPLATS[precision]
@@ -132,7 +132,7 @@ def test_mean_on_the_near_plane_is_visible_and_one_before_it_is_not(precision, n
     np.testing.assert_array_equal(np.array(splats.visible), expected)
 
 
-def with_border_at(part) -> tuple[effects.Lens, reference.Camera]:
+def with_border_at(part) -> tuple[lenses.Lens, reference.Camera]:
     """Half a side is a part of the largest distorted radius; the corners are sqrt(2) as far."""
     lens = OpenCV(k1=-0.3125)
     half = part * (2 / 3) * lens.valid_radius
@@ -250,7 +250,7 @@ def test_image_equals_the_reference(precision, name, scene, count):
     for plane, values in zip(found, expected, strict=True):
         tolerance = IMAGE[precision] * np.abs(values).max()
         np.testing.assert_allclose(plane[~marked], values[~marked], rtol=0, atol=tolerance)
-    splats = effects.project(reference.Gaussians(**case.values), reference_camera(case), lens)
+    splats = lenses.project(reference.Gaussians(**case.values), reference_camera(case), lens)
     x, y = splats.means2d[splats.visible].T
     beside = (x < 0) | (y < 0) | (x > case.width) | (y > case.height)
     assert (beside.sum() >= 5 or name == "panorama") and (expected[0] < 0.5).mean() > 0.2

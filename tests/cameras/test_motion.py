@@ -8,6 +8,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support import reference_effects
 from support.cases import close_camera, reference_camera, shutter, with_lens
 from support.helpers import (
     FLOAT32,
@@ -30,7 +31,7 @@ from drgs.cameras.motion import (
 )
 from drgs.core.arrays import types_of
 from drgs.effects.compose import with_effects
-from drgs.reference import effects
+from drgs.reference import lenses
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 from drgs.testing import Case
@@ -52,7 +53,7 @@ def test_poses_match_the_reference(precision, angle):
     motion = Motion(*Motion.relative_motion(device, end.rotation, end.center))
     for time in (0.0, 0.25, 1.0):
         actual = motion.pose(device, precision.Float(time))
-        expected = effects.camera_at(camera, close, time)
+        expected = reference_effects.camera_at(camera, close, time)
         # Products of some ten roundings; the turn's axis is found by its sine.
         tolerance = {FLOAT64: 1e-14, FLOAT32: 2e-6}[precision]
         rotation = np.array(actual.rotation).astype(np.float64)[..., 0]
@@ -85,15 +86,15 @@ def test_horizontal_motion_is_exact_at_row_centers():
         points, np.tile([1.0, 0, 0, 0], (len(y), 1)), np.full((len(y), 3), np.log(0.05)),
         np.full(len(y), 2.0), np.zeros((len(y), 1, 3)), np.zeros((len(y), 0, 3)),
     )  # fmt: skip
-    device = lens_camera(camera, effects.Pinhole(), FLOAT64)
-    end = lens_camera(close, effects.Pinhole(), FLOAT64)
+    device = lens_camera(camera, lenses.Pinhole(), FLOAT64)
+    end = lens_camera(close, lenses.Pinhole(), FLOAT64)
     motion = Motion.relative_motion(device, end.rotation, end.center)
     device = replace(device, shutter=RollingShutter(*motion))
     splats = device_gaussians(gaussians, FLOAT64)
     pipeline = with_effects(rendering.Pipeline(0), splats, device)
     frame = rendering.render(splats, device, pipeline)
     alpha = 1 - planes_of(frame)[0].reshape(height, 32)
-    expected = effects.render_rolling_shutter(gaussians, camera, close)
+    expected = reference_effects.render_rolling_shutter(gaussians, camera, close)
     rows_of_splats = y.astype(int)
     np.testing.assert_allclose(
         alpha[rows_of_splats], expected.alpha[rows_of_splats], rtol=0, atol=1e-12

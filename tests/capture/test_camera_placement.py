@@ -17,11 +17,6 @@ from drgs.capture.camera_placement import (
 from drgs.capture.path_tracing import CaptureCamera, CaptureSettings, bounding_box
 from drgs.core.errors import UserError
 
-TWO_SIDED = {"type": "twosided", "bsdf": {"type": "diffuse"}}
-
-ROOM = {"type": "cube", "bsdf": TWO_SIDED}
-"""Cube of side 2; the outer sides of its walls are the fronts."""
-
 LAMP = {
     "type": "sphere",
     "radius": 0.1,
@@ -69,27 +64,6 @@ def centers(scene, settings):
     return np.array([view.pose[:3, 3] for view in views_of(scene, settings)])
 
 
-PARTS = {
-    "a room without light outside": {"room": ROOM, "lamp": LAMP},
-    "a room in daylight": {"room": ROOM, "lamp": LAMP, "sky": SKY},
-    "a ball": {"ball": BALL, "sky": SKY},
-    "a ball, dark inside": {"ball": {"type": "sphere", "bsdf": TWO_SIDED}, "sky": SKY},
-}
-
-
-@pytest.mark.parametrize("kind", [*PARTS, "a sensor in a room"])
-def test_rooms_are_captured_from_inside_and_objects_from_around(kind):
-    parts = PARTS.get(kind, PARTS["a room in daylight"])
-    if kind == "a sensor in a room":
-        parts = parts | {"sensor": sensor((0.5, 0, 0), (-1, 0, 0))}
-    scene = loaded(**parts)
-    settings, is_inside = derived(scene), kind.endswith(("outside", "in a room"))
-    assert settings.cameras == ("inside" if is_inside else "around")
-    assert (np.abs(centers(scene, settings)) < 1).all() == is_inside
-    for given in ({"distance": 3.0}, {"azimuth": (-20.0, 20.0)}, {"elevation": (0.0, 20.0)}):
-        assert derived(scene, **given).cameras == "around"
-
-
 def test_one_sensor_decides_up_distance_target_and_field_of_view():
     # It looks past the middle at (1.5, 2, 3); the film's smaller side spans 30 degrees.
     seen_from = sensor((1.5, 2, 9), (1.5, 2, 3), fov=30.0, width=16)
@@ -133,15 +107,13 @@ def test_many_sensors_are_used_as_cameras():
         np.testing.assert_allclose(camera.linear(view)[:, :, :3], shown[:, :, :3], atol=0.075)
 
 
-INSIDE, SENSORS = {"cameras": "inside"}, {"cameras": "sensors"}
+SENSORS = {"cameras": "sensors"}
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         (SENSORS, "--cameras sensors: the scene has no sensor of type"),
-        (INSIDE | {"distance": 1.0}, "--distance: is not used with --cameras inside"),
-        (INSIDE | {"target": (3.0, 0.0, 0.0)}, "target must lie within the scene's bounding box"),
         ({"azimuth": (30.0, -30.0)}, "azimuth must be two angles in rising order between -360"),
         ({"elevation": (-91.0, 0.0)}, "elevation must be two angles in rising order between -90"),
         ({"elevation": (0.0, math.nan)}, "elevation must be two angles"),
@@ -161,17 +133,6 @@ def test_placement_options_are_refused_with_sensors():
         message = f"^--{name.replace('_', '-')}: is not used with --cameras sensors; leave it out$"
         with pytest.raises(UserError, match=message):
             derived(scene, **SENSORS, **{name: value})
-
-
-def test_cameras_inside_stand_between_target_and_walls():
-    scene = loaded(room=ROOM)
-    target = (0.4, -0.3, 0.1)
-    settings = derived(scene, cameras="inside", target=target, views=40, test_views=0)
-    for view in views_of(scene, settings):
-        offset = view.pose[:3, 3] - target
-        np.testing.assert_allclose(view.pose[:3, 2], offset / np.linalg.norm(offset), atol=1e-9)
-        # 60 % of the way to the wall behind.
-        assert np.abs(np.array(target) + offset / 0.6).max() == pytest.approx(1, abs=1e-5)
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-z"])

@@ -36,7 +36,7 @@ from drgs.core.errors import UserNote
 from drgs.datasets import load_dataset
 from drgs.export import __main__ as export
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.reference import effects
+from drgs.reference import lenses
 from drgs.reference import splatting as reference
 from drgs.results.folder import VIEWS
 from drgs.results.refined_cameras import write_views
@@ -187,7 +187,7 @@ def test_panoramas_equal_the_reference(fit, tmp_path, way):
     run(fit / "point_cloud.ply", *words, "--panorama", "--size", 60, 30, "--out", out)
     gaussians = {k: getattr(blobs(), k).astype(float) for k in PARAMETER_NAMES}
     camera = reference.Camera(axes, pose[:3, 3], 1, 1, 0, 0, 60, 30, 0.2)
-    expected = effects.render(reference.Gaussians(**gaussians), camera, effects.Equirectangular())
+    expected = lenses.render(reference.Gaussians(**gaussians), camera, lenses.Equirectangular())
     image = np.clip(expected.image, 0, 1)
     assert_images_agree(rendered(out / f"{name}.png"), image, expected, EIGHT_BITS)
 

@@ -18,15 +18,14 @@ from support.helpers import (
     single,
 )
 from support.lens_scenes import PINHOLE, covariances, lens_camera, planes_of
+from support.reference_effects import ThinLens, lens_cameras, project_defocused
 from support.reference_lenses import camera_at_origin, gaussians_at
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Aperture
 from drgs.config.approximations import Approximations
 from drgs.effects.defocus import Defocused
-from drgs.reference import effects
 from drgs.reference import splatting as reference
-from drgs.reference.effects import ThinLens
 from drgs.splatting import rendering
 from drgs.splatting.projection import compensated_opacity, ewa, load_rows, plain_opacity, project
 from drgs.testing import Case
@@ -140,7 +139,7 @@ def test_defocused_wall_keeps_alpha_and_colour():
     """
     gaussians, camera = wall()
     device = device_gaussians(gaussians, FLOAT64)
-    pinholes = [aperture_camera(c, FLOAT64, None) for c in effects.lens_cameras(camera, FAR, 64)]
+    pinholes = [aperture_camera(c, FLOAT64, None) for c in lens_cameras(camera, FAR, 64)]
     images = [planes_of(render_composed(device, c, rendering.Pipeline(0))) for c in pinholes]
     mean, found = np.mean(images, axis=0), planes_of_wall()
     thicker = 1 + 0.2 / 4 + 0.2**2 / 9 + 0.2**3 / 16
@@ -180,7 +179,7 @@ def test_splats_invisible_in_focus_stay_invisible_when_defocused(precision):
     gaussians = replace(gaussians, logit_opacities=single(np.log(opacities / (1 - opacities))))
     for low_pass, visible in ((0.3, [1, 1, 0, 1]), (1e-18, [1, 1, 0, 0])):
         splats = splats_of(gaussians, camera, precision, FAR, low_pass=low_pass)
-        expected = effects.project(gaussians, camera, low_pass=low_pass, defocus=FAR)
+        expected = project_defocused(gaussians, camera, FAR, low_pass=low_pass)
         np.testing.assert_array_equal(np.array(splats.visible), visible)
         np.testing.assert_array_equal(expected.visible, visible)
         assert rows(splats.opacities).max() < reference.ALPHA_CUT
@@ -212,7 +211,7 @@ def test_splat_blurred_over_thousands_of_pixels_matches_the_reference_covariance
     camera = camera_at_origin(fx=200.0, fy=200.0)
     defocus = ThinLens(1.0, 4.0)
     gaussians = gaussians_at([[0.001, -0.002, 0.015625], [0.1, 0.1, 100.0]], 2.0**-10)
-    expected = effects.project(gaussians, camera, defocus=defocus)
+    expected = project_defocused(gaussians, camera, defocus)
     splats = splats_of(gaussians, camera, precision, defocus)
     sizes = np.abs(expected.cov2d).max(axis=(1, 2), keepdims=True)
     assert sizes[0] > 1e7

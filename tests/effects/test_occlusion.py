@@ -10,11 +10,11 @@ import pytest
 from drjit.llvm import ad as llvm
 from support.cases import edges, reference_camera, stacked
 from support.helpers import NEAR_THRESHOLD, single
+from support.reference_effects import render_with_surfaces
 
 from drgs.core.arrays import from_host
 from drgs.effects.occlusion import OccludedFeatures, Surface
 from drgs.reference import splatting as reference
-from drgs.reference.effects import render_with_surfaces
 from drgs.splatting import order, rendering
 from drgs.splatting.grid import TileGrid
 from drgs.testing import LAWS, Case, image_equals_reference

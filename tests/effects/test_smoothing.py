@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from plyfile import PlyData
+from support import reference_effects
 from support.cases import rates_of, smoothed_reference
 from support.helpers import (
     FLOAT32,
@@ -27,7 +28,6 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.core.errors import UserError
 from drgs.effects.smoothing import apply_smoothing, bake_smoothing, smoothing_of
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.reference import effects as reference_effects
 from drgs.reference import splatting as reference
 from drgs.splatting.projection import load_rows
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from conftest import REPOSITORY, run_program
 
-OPTIONAL = ("mpi4py", "pycolmap", "tensorboardX", "viser")  # of the extra "dev"
+OPTIONAL = ("mpi4py", "pycolmap", "viser")  # of the extra "dev"
 CHECKER = shutil.which("basedpyright", path=str(Path(sys.executable).parent))
 
 

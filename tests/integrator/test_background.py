@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support import reference_effects
 from support.backgrounds import (
     CLOSE,
     EMITTERS,
@@ -29,7 +30,6 @@ from support.views import (
 from support.wall_scenes import to_display
 
 import drgs  # noqa: F401  (registers the plugins)
-from drgs.reference import effects
 from drgs.reference import splatting as reference
 
 CAMERAS = {
@@ -157,7 +157,7 @@ def test_a_background_texture_is_stretched_over_the_film_upright(view, srgb_prim
 
 def test_defocused_environment_is_the_mean_of_pinholes_in_the_aperture():
     """The pinholes' principal points agree on the plane in focus."""
-    lens = effects.ThinLens(0.25, 1.25)
+    lens = reference_effects.ThinLens(0.25, 1.25)
     aperture = {"aperture_radius": 0.25, "focus_distance": 1.25}
     sensor = VIEW.with_sensor("thinlens", fov=55.0, **aperture)
     image = image_before(EMITTERS["envmap"](), sensor, is_hidden=True)
@@ -167,7 +167,7 @@ def test_defocused_environment_is_the_mean_of_pinholes_in_the_aperture():
         np.eye(3), np.zeros(3), focal, focal, width / 2, height / 2, width, height
     )
     images = []
-    for camera in effects.lens_cameras(plain, lens, 16):
+    for camera in reference_effects.lens_cameras(plain, lens, 16):
         pinhole = calibrated(fx=focal, fy=focal, cx=camera.cx, cy=camera.cy)
         images.append(image_before(EMITTERS["envmap"](), pinhole, is_hidden=True))
     np.testing.assert_allclose(image, np.mean(images, axis=0), atol=IMAGE)
@@ -178,7 +178,7 @@ def pose_at(time) -> np.ndarray:
     """Mitsuba's 4 x 4 between the two poses of a camera that moves, by the reference."""
     flip = np.diag([-1.0, -1.0, 1.0])
     ends = [(flip @ np.array(m)[:3, :3].T, np.array(m)[:3, 3]) for m in (VIEW.to_world, CLOSE)]
-    rotation, center = effects.interpolate_pose(*ends, time)
+    rotation, center = reference_effects.interpolate_pose(*ends, time)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = (flip @ rotation).T, center
     return pose

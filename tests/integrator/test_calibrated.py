@@ -32,7 +32,7 @@ from support.lens_scenes import LENSES, points_at
 from support.views import VIEWS, gradients_of, image_of, pose, splats_before
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.reference.effects import OpenCV
+from drgs.reference.lenses import OpenCV
 
 MOVING = [replace(s, close=CLOSE) for s in (PINHOLE, OPENCV, FISHEYE)]
 ROLLING = [replace(s, shutter="rolling") for s in MOVING]

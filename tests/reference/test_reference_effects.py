@@ -12,17 +12,18 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from support import reference_effects
+from support.reference_effects import ThinLens
 from support.reference_lenses import FISHEYE, THIN_PRISM, camera_at_origin, gaussians_at
 from support.reference_scenes import BACKGROUND, assert_images_agree, rotation_about, small_scene
 
-from drgs.reference import effects
+from drgs.reference import lenses
 from drgs.reference import splatting as reference
-from drgs.reference.effects import (
+from drgs.reference.lenses import (
     Fisheye,
     OpenCV,
     Orthographic,
     Pinhole,
-    ThinLens,
     ThinPrismFisheye,
 )
 from drgs.reference.splatting import Camera
@@ -175,7 +176,7 @@ def test_lenses_have_no_fold_within_their_limit(kind, sizes):
 
 def test_a_singular_splat_is_not_visible():
     gaussians = gaussians_at([0, 0, 1], [1e-200, 1e-200, 0.1])
-    splats = effects.project(gaussians, camera_at_origin(), Orthographic(), low_pass=0.0)
+    splats = lenses.project(gaussians, camera_at_origin(), Orthographic(), low_pass=0.0)
     assert not splats.visible.any() and np.isfinite(splats.conics).all()
 
 
@@ -183,7 +184,7 @@ def test_a_singular_splat_is_not_visible():
 def test_invisible_splats_have_finite_values(lens):
     means = np.array([[0, 0, 0], [0, 0, -1], [1, 2, 0], [3, 0, 0.011], [0, 0, 2.0], [1e3, 0, 1]])
     with np.errstate(all="raise"):
-        splats = effects.project(gaussians_at(means), camera_at_origin(), lens, defocus=None)
+        splats = lenses.project(gaussians_at(means), camera_at_origin(), lens)
     for field in fields(splats):
         assert np.isfinite(getattr(splats, field.name)).all(), field.name
     assert splats.visible[4] and not splats.visible[0]
@@ -216,7 +217,7 @@ def test_pinhole_image_matches_the_reference(lens, antialiased, degree):
     """Splat 9's slopes are clamped in J, 10 is behind the camera, 11 is too faint."""
     gaussians, camera = small_scene()
     expected = reference.render(gaussians, camera, BACKGROUND, degree, antialiased)
-    actual = effects.render(gaussians, camera, lens, BACKGROUND, antialiased, degree=degree)
+    actual = lenses.render(gaussians, camera, lens, BACKGROUND, antialiased, degree=degree)
     # J by differences: 1e-13 of itself. Measured: 3e-14.
     assert_images_agree(actual, expected, 1e-10)
     np.testing.assert_array_equal(actual.near_threshold, expected.near_threshold)
@@ -230,16 +231,17 @@ def test_defocused_moments_match_many_pinholes(depth):
     mean = camera.rotation.T @ [0.1, -0.2, depth] + camera.center
     gaussians = gaussians_at(mean, [[0.02, 0.03, 0.01]], quats=[0.3, 0.8, -0.5, 0.1])
     lens_splats = [
-        reference.project(gaussians, c) for c in effects.lens_cameras(camera, defocus, 1000)
+        reference.project(gaussians, c)
+        for c in reference_effects.lens_cameras(camera, defocus, 1000)
     ]
     means2d = np.array([s.means2d[0] for s in lens_splats])
     cov2d = np.mean([s.cov2d[0] for s in lens_splats], axis=0) + np.cov(means2d.T, bias=True)
-    splats = effects.project(gaussians, camera, defocus=defocus)
+    splats = reference_effects.project_defocused(gaussians, camera, defocus)
     # The sunflower's moments are a disc's to about 1e-3, and J differs between the pinholes by
     # the aperture's angle squared, 0.01 at depth 1. Measured: 1e-3.
     np.testing.assert_allclose(means2d.mean(axis=0), splats.means2d[0], atol=2e-2)
     np.testing.assert_allclose(splats.cov2d[0], cov2d, rtol=0, atol=2e-3 * cov2d.max())
-    assert (depth == 2.0) == np.allclose(splats.cov2d, effects.project(gaussians, camera).cov2d)
+    assert (depth == 2.0) == np.allclose(splats.cov2d, lenses.project(gaussians, camera).cov2d)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.4, -2.0, 3.1, math.pi, 1.5 * math.pi])
@@ -249,7 +251,7 @@ def test_pose_rotates_by_a_fraction_of_the_angle(angle, t):
     axis, start = [0.3, -1.0, 0.5], rotation_about([1.0, 0.2, 0.1], 1.3)
     open = start, np.array([1.0, -2.0, 1e6])
     close = rotation_about(axis, angle) @ start, np.array([3.0, -2.0, -1e6])
-    rotation, center = effects.interpolate_pose(open, close, t)
+    rotation, center = reference_effects.interpolate_pose(open, close, t)
     arcs = [angle - 2 * math.pi] if angle > math.pi else [angle]
     arcs += [-angle] * (angle == math.pi)
     ways = [rotation_about(axis, t * arc) @ start for arc in arcs]
@@ -262,7 +264,7 @@ def test_a_pixel_is_marked_if_it_is_near_a_threshold_at_any_time():
     close = replace(camera, center=np.array([0.5, 0.0, 0.0]))
     # At time 1/4 it is at the centre of pixel [4, 4], at 3/4 of [4, 2]; there alpha is its opacity.
     gaussians = gaussians_at([0.125, 0, 1.0], 0.1, opacity=reference.ALPHA_MAX)
-    marked = effects.render_motion_blur(gaussians, camera, close, 2).near_threshold
+    marked = reference_effects.render_motion_blur(gaussians, camera, close, 2).near_threshold
     expected = np.zeros((9, 9), dtype=bool)
     expected[4, [2, 4]] = True
     np.testing.assert_array_equal(marked, expected)
@@ -271,7 +273,7 @@ def test_a_pixel_is_marked_if_it_is_near_a_threshold_at_any_time():
 def test_smoothing_is_a_convolution():
     """On one axis: a sampled Gaussian convolved with one of variance 0.2 / rate^2."""
     scale, rate, opacity = 0.03, 12.0, 0.7
-    scales, opacities = effects.smoothing_filter(
+    scales, opacities = reference_effects.smoothing_filter(
         np.log([[scale, 1e6, 1e6]]), np.array([math.log(0.7 / 0.3)]), np.array([rate])
     )
     x = np.linspace(-1, 1, 4001)

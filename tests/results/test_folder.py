@@ -161,7 +161,6 @@ EFFECT_NAMES = {f"effects/{e.name}.py": set(e.value.files) for e in EFFECTS.all(
 OTHER_NAMES = {files.CONFIG, *result_names()} - set().union(*EFFECT_NAMES.values())
 
 ALLOWED_NAMES = {
-    "fit/__main__.py": {files.TENSORBOARD},
     "results/folder.py": OTHER_NAMES,
     **EFFECT_NAMES,
 }

@@ -9,9 +9,10 @@ import numpy as np
 
 from drgs.cameras.camera import Camera
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.reference import effects
+from drgs.reference import lenses
 from drgs.reference import splatting as reference
-from drgs.reference.effects import Equirectangular, Fisheye, OpenCV, Pinhole, ThinPrismFisheye
+from drgs.reference.lenses import Equirectangular, Fisheye, OpenCV, Pinhole, ThinPrismFisheye
+from support import reference_effects
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES, rolling_image
 from support.views import VIEWS, Scene, View, pose, splats_before
@@ -33,7 +34,7 @@ class Calibrated:
     """A sensor: its dictionary, and what the reference makes of it."""
 
     name: str
-    lens: effects.Lens = Pinhole()  # noqa: RUF009
+    lens: lenses.Lens = Pinhole()  # noqa: RUF009
     view: View = View("", 53, 41, crop=WINDOW)  # noqa: RUF009
     f: tuple[float, float] = (40.0, 44.0)  # fx, fy, px
     c: tuple[float, float] = (24.0, 22.5)  # cx, cy, px
@@ -73,15 +74,15 @@ class Calibrated:
         return replace(self.camera, rotation=at_close.rotation, center=at_close.center)
 
     def camera_at(self, time: float) -> reference.Camera:
-        return effects.camera_at(self.camera, self.close_camera, time)
+        return reference_effects.camera_at(self.camera, self.close_camera, time)
 
     def rendered(self, gaussians) -> reference.RenderedImage:
         """The whole film by the reference, on black; motion with SHUTTER_SAMPLES."""
         if self.close is None:
-            return effects.render(gaussians, self.camera, self.lens, threshold_width=NEAR_THRESHOLD)
+            return lenses.render(gaussians, self.camera, self.lens, threshold_width=NEAR_THRESHOLD)
         if self.shutter == "rolling":
             return rolling_image(gaussians, self.camera_at, self.lens, 1, NEAR_THRESHOLD)
-        return effects.render_motion_blur(
+        return reference_effects.render_motion_blur(
             gaussians, self.camera, self.close_camera, SHUTTER_SAMPLES, np.zeros(3), self.lens,
             NEAR_THRESHOLD,
         )  # fmt: skip

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from drgs.cameras.motion import MotionBlur, RollingShutter
 from drgs.core.arrays import types_of
-from drgs.reference import effects, rays
+from drgs.reference import lenses, rays
 from drgs.reference import splatting as reference
 from drgs.testing import Case, Values, adjoint_is_transpose, bytes_are_reproducible, single
-from support import helpers
+from support import helpers, reference_effects
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import (
     FOCAL,
@@ -31,7 +31,7 @@ from support.lens_scenes import (
 )
 
 MOTION_SAMPLES = 3
-PINHOLE = effects.Pinhole()
+PINHOLE = lenses.Pinhole()
 
 
 # ----------------------------------------------------------------------------------------------
@@ -67,14 +67,13 @@ def by_effects(case, values, lens=PINHOLE):
     gaussians = reference.Gaussians(**values)
     if case.smoothing is not None:
         gaussians = smoothed_reference(gaussians, np.full(case.count, case.smoothing))
-    defocus = case.aperture and effects.ThinLens(*case.aperture)
-    antialiased = case.approximations.get("antialiased", False)
-    return planes_of(
-        effects.render(
-            gaussians, reference_camera(case), lens, np.zeros(3), antialiased,
-            defocus, case.degree, NEAR_THRESHOLD,
-        )
-    )  # fmt: skip
+    camera, antialiased = reference_camera(case), case.approximations.get("antialiased", False)
+    settings = lens, antialiased, case.degree, NEAR_THRESHOLD
+    if case.aperture is not None:
+        defocus = reference_effects.ThinLens(*case.aperture)
+        return planes_of(reference_effects.render_defocused(gaussians, camera, defocus, *settings))
+    lens, *others = settings
+    return planes_of(lenses.render(gaussians, camera, lens, np.zeros(3), *others))
 
 
 def rates_of(smoothing) -> np.ndarray:
@@ -84,7 +83,7 @@ def rates_of(smoothing) -> np.ndarray:
 
 def smoothed_reference(gaussians: reference.Gaussians, smoothing) -> reference.Gaussians:
     """Gaussians whose parameters hold the filter."""
-    scales, opacities = effects.smoothing_filter(
+    scales, opacities = reference_effects.smoothing_filter(
         gaussians.log_scales, gaussians.logit_opacities, rates_of(smoothing)
     )
     logits = np.log(opacities) - np.log1p(-opacities)
@@ -113,7 +112,7 @@ def shutter(kind, *arguments, travel=TRAVEL, turn=TURN):
 def by_motion(case, values, lens=PINHOLE):
     camera = reference_camera(case)
     return planes_of(
-        effects.render_motion_blur(
+        reference_effects.render_motion_blur(
             reference.Gaussians(**values), camera, close_camera(camera), MOTION_SAMPLES,
             np.zeros(3), lens, NEAR_THRESHOLD,
         )
@@ -123,7 +122,7 @@ def by_motion(case, values, lens=PINHOLE):
 def by_rows(case, values, lens=PINHOLE):
     """A rolling shutter: each splat as a whole at the time when the row of its mean is read."""
     camera = reference_camera(case)
-    camera_at = partial(effects.camera_at, camera, close_camera(camera))
+    camera_at = partial(reference_effects.camera_at, camera, close_camera(camera))
     gaussians = reference.Gaussians(**values)
     return planes_of(rolling_image(gaussians, camera_at, lens, case.degree, NEAR_THRESHOLD))
 
@@ -132,7 +131,7 @@ def by_lens_rays(case, values, lens=PINHOLE):
     """The peaks along each pixel's ray, at its row's time if the shutter rolls."""
     first, gaussians = reference_camera(case), reference.Gaussians(**values)
     last = first if case.shutter is None else close_camera(first)
-    camera_at = partial(effects.camera_at, first, last)
+    camera_at = partial(reference_effects.camera_at, first, last)
     y = np.arange(case.height) + 0.5
     rows = [lens_rays(lens, camera_at(each / case.height), each) for each in y]
     times = [row_time(camera_at, lens, mean)[0] for mean in gaussians.means]
@@ -171,7 +170,7 @@ def lens_rays(lens, camera, y) -> tuple[np.ndarray, np.ndarray]:
     """Origins and directions (W, 3), world, of a row of pixels; a depth of 1 along each."""
     film = np.column_stack([np.arange(camera.width) + 0.5, np.full(camera.width, y)])
     points = points_at(lens, camera, film, np.ones(len(film)))
-    starts = points * [1, 1, 0] if isinstance(lens, effects.Orthographic) else 0 * points
+    starts = points * [1, 1, 0] if isinstance(lens, lenses.Orthographic) else 0 * points
     # Not the transpose: a rotation rounded to single precision is orthogonal to 1e-7.
     to_world = np.linalg.inv(camera.rotation).T
     return starts @ to_world + camera.center, (points - starts) @ to_world
@@ -187,12 +186,12 @@ def splat_of(lens, camera, gaussians, k) -> tuple | None:
     point = (one.means - camera.center) @ camera.rotation.T
     if not lens.is_seen(camera, point)[0]:
         return None
-    jacobian = effects.jacobians(lens, camera, point)[0]
+    jacobian = lenses.jacobians(lens, camera, point)[0]
     depth = lens.depths(camera, point)
-    by_z = not isinstance(lens, (effects.Fisheye, effects.Equirectangular))
+    by_z = not isinstance(lens, (lenses.Fisheye, lenses.Equirectangular))
     toward = np.array([0, 0, 1 / depth[0]]) if by_z else point[0] / depth**2
     added = np.linalg.inv(np.vstack([jacobian, toward]) @ camera.rotation)[:, :2]
-    colors = effects.sh_colors(one, camera, lens, one.sh_degree)
+    colors = lenses.sh_colors(one, camera, lens, one.sh_degree)
     return colors[0], added @ added.T, depth[0]
 
 
@@ -340,7 +339,7 @@ def with_lens(name, effect="lens", reference_of=by_effects, **options) -> Case:
     """A case with a lens of the reference and of the kernels."""
     lens = ALL_LENSES[name]
     options.setdefault("focal", FOCAL.get(type(lens), 26.0))
-    if isinstance(lens, effects.Equirectangular):
+    if isinstance(lens, lenses.Equirectangular):
         options.setdefault("scene", all_around)
     if (effect, name) == ("rolling shutter", "panorama"):
         reference_of = None  # a mean may be in several rows: which one shows it is open
@@ -471,15 +470,26 @@ CASES = [
     with_lens("rational", "edges", by_effects, scene=edges),
     *(
         with_lens(
-            name, f"along rays, {scene.__name__}", by_lens_rays,
-            scene=partial(scene, ALL_LENSES[name]), approximations={"projection": "exact"},
+            name,
+            f"along rays, {scene.__name__}",
+            by_lens_rays,
+            scene=partial(scene, ALL_LENSES[name]),
+            approximations={"projection": "exact"},
         )
         for scene in (large_behind, edges_behind)
         for name in ("rational", "fisheye", "thin prism")
     ),
-    Case("along rays, needles", reference=by_lens_rays, scene=needles, width=40, height=23,
-         focal=20.0, count=8, shutter=shutter(RollingShutter),
-         approximations={"projection": "exact"}),
+    Case(
+        "along rays, needles",
+        reference=by_lens_rays,
+        scene=needles,
+        width=40,
+        height=23,
+        focal=20.0,
+        count=8,
+        shutter=shutter(RollingShutter),
+        approximations={"projection": "exact"},
+    ),
     *(
         Case(f"{name}, pinhole", approximations=options, reference=by_rays)
         for name, options in APPROXIMATIONS.items()

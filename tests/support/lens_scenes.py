@@ -14,9 +14,9 @@ from drgs.cameras import equirectangular, fisheye, orthographic, thin_prism_fish
 from drgs.cameras import lens as camera_lens
 from drgs.cameras.camera import Camera
 from drgs.cameras.radial_tangential import RadialTangential
-from drgs.reference import effects
+from drgs.reference import lenses
 from drgs.reference import splatting as reference
-from drgs.reference.effects import Equirectangular, Fisheye, OpenCV, Orthographic, ThinPrismFisheye
+from drgs.reference.lenses import Equirectangular, Fisheye, OpenCV, Orthographic, ThinPrismFisheye
 from drgs.splatting.projection import ewa, load_rows, plain_opacity, project
 from support.helpers import (
     FLOAT32,
@@ -54,12 +54,12 @@ LENSES = {
 }
 
 
-PINHOLE = effects.Pinhole()
+PINHOLE = lenses.Pinhole()
 
 
-def kernel_lens(lens: effects.Lens) -> object:
+def kernel_lens(lens: lenses.Lens) -> object:
     """The kernels' lens with the coefficients of the reference's that are not zero."""
-    if isinstance(lens, effects.Pinhole):
+    if isinstance(lens, lenses.Pinhole):
         return camera_lens.PINHOLE
     given = {name: value for name, value in asdict(lens).items() if value != 0}
     if isinstance(lens, OpenCV):
@@ -75,14 +75,14 @@ def kernel_lens(lens: effects.Lens) -> object:
     )
 
 
-def lens_camera(camera: reference.Camera, lens: effects.Lens, precision: Precision) -> Camera:
+def lens_camera(camera: reference.Camera, lens: lenses.Lens, precision: Precision) -> Camera:
     """The kernels' camera; no number of it is a literal."""
     camera = device_camera(camera, precision).with_lens(kernel_lens(lens))
     dr.make_opaque(camera)
     return camera
 
 
-def points_at(lens: effects.Lens, camera: reference.Camera, film, distances) -> np.ndarray:
+def points_at(lens: lenses.Lens, camera: reference.Camera, film, distances) -> np.ndarray:
     """Points (N, 3), camera axes, that are seen at ``film`` (N, 2), px; NaN where nothing is.
 
     distances (N,): z, or from the centre where that is the depth. By the inverse of the reference:
@@ -133,7 +133,7 @@ def _fisheye_directions(lens, plane) -> np.ndarray:
 FOCAL = {Fisheye: 10.0, ThinPrismFisheye: 10.0, Orthographic: 12.0, Equirectangular: 6.0}
 
 
-def camera_behind(lens: effects.Lens, seed=0, width=37, height=29) -> reference.Camera:
+def camera_behind(lens: lenses.Lens, seed=0, width=37, height=29) -> reference.Camera:
     """Rotated, fx != fy, off-centre; films whose corners are 50 to 65 degrees from the axis.
 
     With a fisheye they are up to 140 degrees, with a barrel beyond the fold.
@@ -255,15 +255,15 @@ def as_read(splat, gaussian, camera_at, lens, time) -> reference.Projection:
 
     With the velocity v on the film, px, by differences: A = (I - v e_y^T / height)^-1.
     """
-    step, weights = 2.0**-7, effects.CENTRAL_WEIGHTS
+    step, weights = 2.0**-7, lenses.CENTRAL_WEIGHTS
     steps = step * np.arange(1, len(weights) + 1)
 
     def point(at) -> np.ndarray:
         return (gaussian.means - camera_at(at).center) @ camera_at(at).rotation.T
 
     moves = [point(time + each) - point(time - each) for each in steps]
-    place = effects._points_of_jacobian(lens, camera_at(time), point(time))
-    velocity = effects.jacobians(lens, camera_at(time), place)[0] @ (
+    place = lenses._points_of_jacobian(lens, camera_at(time), point(time))
+    velocity = lenses.jacobians(lens, camera_at(time), place)[0] @ (
         np.tensordot(weights, moves, axes=1)[0] / step
     )
     height = camera_at(time).height
@@ -284,12 +284,12 @@ def rolling_image(gaussians, camera_at, lens, degree, threshold_width) -> refere
     ]
     bounds = lens.slope_bounds(cameras[0])  # wherever the camera is, and slow to compute
     with mock.patch.object(type(lens), "slope_bounds", lambda *_: bounds):
-        splats = [effects.project(*pair, lens) for pair in pairs]
+        splats = [lenses.project(*pair, lens) for pair in pairs]
         splats = [
             as_read(splat, pair[0], camera_at, lens, time) if is_read and splat.visible else splat
             for splat, pair, (time, is_read) in zip(splats, pairs, times, strict=True)
         ]
-    colors = np.concatenate([effects.sh_colors(*pair, lens, degree) for pair in pairs])
+    colors = np.concatenate([lenses.sh_colors(*pair, lens, degree) for pair in pairs])
     arrays = ("means2d", "cov2d", "conics", "depths", "opacities", "visible")
     splats = reference.Projection(
         *(np.concatenate([getattr(each, name) for each in splats]) for name in arrays)

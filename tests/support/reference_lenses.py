@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drgs.reference.effects import Fisheye, ThinPrismFisheye
+from drgs.reference.lenses import Fisheye, ThinPrismFisheye
 from drgs.reference.splatting import Camera, Gaussians
 
 FISHEYE = Fisheye(-0.03125, 0.015625, -0.0078125, 0.001953125)

@@ -8,8 +8,8 @@ import numpy as np
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.reference import splatting as reference
-from drgs.reference.effects import render_with_surfaces
 from support.helpers import clear
+from support.reference_effects import render_with_surfaces
 from support.views import VIEWS, Scene, decode
 
 # Tolerances of test_splats: single precision, relative to the largest value of an array.

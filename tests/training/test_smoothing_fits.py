@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support import reference_effects
 from support import small_fits as fits
 from support.cases import smoothed_reference
 from support.fit_command import assert_fits, without_images, write_scene
@@ -11,7 +12,6 @@ from support.viewer_rendering import VIEWER_RENDERING
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.reference import effects as reference_effects
 from drgs.training.steps import view_of
 
 

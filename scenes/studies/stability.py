@@ -1,4 +1,4 @@
-"""``python -m drgs.bench stability``: errors of single precision, and their causes.
+"""Measure the errors of single precision, and find their causes.
 
 Four families of scenes become harder step by step. Each step compares the float32 kernels with the
 float64 reference, and their error with the *noise*: the change of the reference's result when every
@@ -12,14 +12,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
 import drjit.llvm.ad as llvm
 import numpy as np
-
-from drgs.bench.output import add_out, columns_table, machine, write_rows
+from drgs.bench.output import columns_table, machine, write_rows
 from drgs.bench.scenes import device_camera
-from drgs.cli.commands import CommandParser
 from drgs.core.types import Float
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io.figures import new_figure, write_figure
@@ -70,15 +70,13 @@ ERRORS = [
 ]
 
 
-def add_arguments(parser: CommandParser) -> None:
-    """Add the arguments of the command."""
-    parser.show_examples("%(prog)s --quick")
-    add_out(parser, run, "stability.csv", "stability.png")
-    parser.add_argument("--quick", action="store_true", help="fewer steps and samples")
-
-
-def run(args: argparse.Namespace) -> None:
+def main() -> None:
     """Measure all sweeps; print tables, write CSV and plot."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="fewer steps and samples")
+    parser.add_argument("--out", type=Path, default=Path("out/studies/stability"), metavar="DIR")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
     samples = 4 if args.quick else 12
     results = []
     print(f"float32 kernels against the float64 reference; {machine()}")
@@ -296,3 +294,7 @@ def plot(results: Sequence[StabilityMeasurement]) -> Figure:
     axes[0].legend(fontsize=8)
     figure.suptitle("float32 kernels against the float64 reference")
     return figure
+
+
+if __name__ == "__main__":
+    main()

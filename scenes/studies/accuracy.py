@@ -1,4 +1,4 @@
-"""``python -m drgs.bench accuracy SCENE``: error and time of each approximation.
+"""Measure the error and the time of each approximation, on a fit and on a stress scene.
 
 Compares renderings of a trained and a stress scene (wide lens, large splats near the camera,
 interpenetrating layers) with the most accurate form: the float64 numpy reference that evaluates
@@ -14,23 +14,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
 import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
-
 from drgs.accuracy.error_budget import Search
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.bench.output import (
-    add_out,
     count_operations,
     machine,
     markdown_table,
     time_in_turns,
     write_rows,
 )
-from drgs.bench.scenes import bench_camera, device_camera, stress_scene
+from drgs.bench.scenes import bench_camera, device_camera
 from drgs.cameras.camera import Camera
-from drgs.cli.commands import CommandParser
+from drgs.cli.ending import exit_on_user_error
 from drgs.config.approximations import Approximations
 from drgs.config.load import load_config
 from drgs.core.errors import UserError
@@ -123,10 +122,9 @@ class AccuracyMeasurement:
         return 10 ** (-self.psnr / 20)
 
 
-def add_arguments(parser: CommandParser) -> None:
-    """Add the arguments of the command."""
-    parser.show_examples("%(prog)s out/lego")
-    add_out(parser, run, "accuracy.csv", *PLOTS)
+def main() -> None:
+    """Entry point of the command."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     add_scene(parser)
     parser.add_argument("--views", type=int, default=3, help="test views of a fit (default: 3)")
     parser.add_argument(
@@ -137,9 +135,13 @@ def add_arguments(parser: CommandParser) -> None:
         help=f"error budgets, see drgs render (default: {' '.join(map(str, BUDGETS))})",
     )
     parser.add_argument("--quick", action="store_true", help="one view, fewer rounds")
+    parser.add_argument("--out", type=Path, default=Path("out/studies/accuracy"), metavar="DIR")
+    args = parser.parse_args()
+    with exit_on_user_error():
+        run(args)
 
 
-def add_scene(parser: CommandParser) -> None:
+def add_scene(parser: argparse.ArgumentParser) -> None:
     """Add the argument that :func:`load_subject` reads."""
     parser.add_argument(
         "scene",
@@ -151,11 +153,12 @@ def add_scene(parser: CommandParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure both scenes; write table, CSV and plots."""
+    """Measure both scenes; print tables, write CSV and plots."""
     subjects = [
         load_subject(Path(args.scene), 1 if args.quick else args.views),
         Subject("stress", *stress_scene(FILM_SIZE_PX), (0.0, 0.0, 0.0)),
     ]
+    args.out.mkdir(parents=True, exist_ok=True)
     print(f"{machine()}")
     results = []
     for subject in subjects:
@@ -174,6 +177,52 @@ def run(args: argparse.Namespace) -> None:
     write_rows(args.out / "accuracy.csv", AccuracyMeasurement, results)
     for subject, name in zip(subjects, PLOTS, strict=True):
         write_figure(args.out / name, plot([m for m in results if m.scene == subject.name]))
+
+
+def stress_scene(size: int, seed: int = 0) -> tuple[Gaussians, list[reference.Camera]]:
+    """Return a scene that is hard for the affine approximation and a global depth order.
+
+    A 110 degree lens; two layers of flat discs that cross in the image's middle; large, faint
+    splats close to the camera; a shell of splats around the scene.
+    """
+    rng = np.random.default_rng(seed)
+    layer, near, shell = 700, 60, 1500
+
+    def crossing(angle: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return discs on a plane through (0, 0, 3), rotated about the vertical axis."""
+        u, v = rng.uniform(-3, 3, layer), rng.uniform(-2, 2, layer)
+        means = np.stack([u * np.cos(angle), v, 3 + u * np.sin(angle)], axis=-1)
+        # About y by -angle: the disc's thin axis, z, becomes the plane's normal.
+        quat = [np.cos(-angle / 2), 0, np.sin(-angle / 2), 0]
+        return means, np.tile(quat, (layer, 1))
+
+    directions = rng.normal(size=(shell, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    close = rng.normal(size=(near, 3)) * [0.8, 0.8, 0.3] + [0, 0, 1.2]
+    close[:, 2] = np.maximum(close[:, 2], 0.4)
+    (first, turned), (second, turned_back) = crossing(0.7), crossing(-0.7)
+    means = [first, second, close, directions * rng.uniform(5, 8, (shell, 1))]
+    quats = [turned, turned_back, rng.normal(size=(near, 4)), rng.normal(size=(shell, 4))]
+    scales = [np.tile([0.15, 0.15, 0.004], (2 * layer, 1))]
+    scales += [rng.uniform(0.08, 0.4, (near, 3)), rng.uniform(0.1, 0.6, (shell, 3))]
+    opacities = [rng.uniform(0.5, 0.98, 2 * layer), rng.uniform(0.05, 0.3, near)]
+    opacities = np.concatenate([*opacities, rng.uniform(0.3, 0.9, shell)])
+    colors = [np.tile(color, (layer, 1)) for color in ([0.9, 0.35, 0.1], [0.1, 0.45, 0.85])]
+    colors = np.concatenate([*colors, rng.uniform(0, 1, (near + shell, 3))])
+    colors = np.clip(colors + rng.normal(0, 0.08, colors.shape), 0, 1)
+    values = {
+        "means": np.concatenate(means),
+        "quats": np.concatenate(quats),
+        "log_scales": np.log(np.concatenate(scales)),
+        "logit_opacities": np.log(opacities / (1 - opacities)),
+        "sh0": ((colors - 0.5) / reference.C_00)[:, None],
+        "shN": rng.normal(0, 0.05, (len(colors), 15, 3)),
+    }
+    gaussians = Gaussians(**{name: value.astype(np.float32) for name, value in values.items()})
+    focal = float(np.float32(size / 2 / np.tan(np.radians(110) / 2)))
+    principal_point = size / 2, size / 2
+    camera = reference.Camera(np.eye(3), np.zeros(3), focal, focal, *principal_point, size, size)
+    return gaussians, [camera]
 
 
 def rungs_of_budgets(subject: Subject, budgets: Sequence[float]) -> list[Rung]:
@@ -406,3 +455,7 @@ def plot(results: Sequence[AccuracyMeasurement]) -> Figure:
             else:
                 names.append(name)
     return figure
+
+
+if __name__ == "__main__":
+    main()
