@@ -311,7 +311,12 @@ BROKEN = {
         lambda *a: [1.01 * d for d in of_rays(*a)],
     ),
     "rays that stay where the lens changes": (
-        *("along rays, fisheye", camera_gradients_equal_differences, LensRayFalloff, "along"),
+        *(
+            "along rays, fisheye",
+            camera_gradients_equal_differences,
+            LensRayFalloff,
+            "with_camera_tangents",
+        ),
         lambda falloff, tangents: falloff,
     ),
     # Features

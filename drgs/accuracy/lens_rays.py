@@ -42,9 +42,9 @@ from functools import reduce
 import drjit as dr
 from typing_extensions import override
 
-from drgs.accuracy.exact import (
-    _UNBOUNDED_OUTLINE,
+from drgs.accuracy.peaks import (
     MAX_EXPONENT,
+    UNBOUNDED_OUTLINE,
     AffineDepths,
     bounding_cone,
     seen_along,
@@ -70,9 +70,7 @@ from drgs.splatting.projection import (
 )
 
 NUM_OUTLINE_POINTS = 8
-MAX_OUTLINE_DEVIATION = (
-    4.0  # of the farthest ray from the nearest; more bent outlines are unbounded
-)
+MAX_OUTLINE_DEVIATION = 4.0  # of the farthest point from the nearest; beyond, there is no outline
 OUTLINE_MARGIN = 0.01  # of rounding
 MIN_OUTLINE_VARIANCE = 1e-4  # px^2
 
@@ -122,7 +120,7 @@ class PixelRay:
     origin: Array3f | None  # None: that of the camera
 
     @staticmethod
-    def through(camera: Camera, x: Float, y: Float) -> PixelRay:
+    def from_place(camera: Camera, x: Float, y: Float) -> PixelRay:
         """Return the ray through a place of the film, px."""
         own = replace(camera.in_own_axes(), center=dr.zeros(type(camera.center)))
         if camera.shutter is not None:
@@ -189,7 +187,7 @@ class LensRayFalloff(GaussianFalloff):
     @override
     def bind(self, lanes: Lanes, positions: SamplePositions) -> LensRayFalloff:
         points = positions.points(lanes, type(self.camera.near))
-        rays = tuple(PixelRay.through(self.camera, x, y) for x, y in points)
+        rays = tuple(PixelRay.from_place(self.camera, x, y) for x, y in points)
         if self.camera_tangents is None:
             return replace(self, rays=rays)
         with dr.resume_grad():
@@ -197,13 +195,13 @@ class LensRayFalloff(GaussianFalloff):
             numbers = camera.numbers()
             dr.enable_grad(numbers)
             dr.set_grad(numbers, list(self.camera_tangents))
-            moved = tuple(PixelRay.through(camera, x, y) for x, y in points)
+            moved = tuple(PixelRay.from_place(camera, x, y) for x, y in points)
             dr.forward_to(moved, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
             tangents = dr.grad(moved)
         return replace(self, rays=rays, ray_tangents=tangents)
 
     @override
-    def along(self, camera_tangents: Sequence[Float]) -> LensRayFalloff:
+    def with_camera_tangents(self, camera_tangents: Sequence[Float]) -> LensRayFalloff:
         return replace(self, camera_tangents=tuple(camera_tangents))
 
     @override
@@ -250,7 +248,7 @@ class LensRayFalloff(GaussianFalloff):
         offsets = [dr.select(bounded, offset, 0) for offset in offsets]
         center, factor, is_ellipse = _ellipse_around(offsets)
         found = [*(place + center), *(dr.sqrt(reach) * factor)]
-        everywhere = [x, y, _UNBOUNDED_OUTLINE, 0, _UNBOUNDED_OUTLINE]
+        everywhere = [x, y, UNBOUNDED_OUTLINE, 0, UNBOUNDED_OUTLINE]
         bounded &= is_ellipse
         return [dr.select(bounded, a, b) for a, b in zip(found, everywhere, strict=True)]
 
@@ -289,7 +287,7 @@ class LensRayFalloff(GaussianFalloff):
     def peak(self, geometry: list[Float], x: Float, y: Float) -> tuple[Float, Float]:
         """Return the numerator and the denominator of a peak's depth at a place of the film, px."""
         a, denominator, *_ = _SplatRows.unpack(geometry).crossing(
-            PixelRay.through(self.camera, x, y)
+            PixelRay.from_place(self.camera, x, y)
         )
         return a, denominator
 

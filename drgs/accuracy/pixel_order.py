@@ -29,13 +29,8 @@ from typing import TypeVar, cast
 import drjit as dr
 from typing_extensions import override
 
-from drgs.accuracy.exact import (
-    AffineDepths,
-    RayDepths,
-    RayFalloff,
-    WithAffineDepth,
-    ewa_with_depth,
-)
+from drgs.accuracy.exact import RayDepths, RayFalloff
+from drgs.accuracy.peaks import AffineDepths, WithAffineDepth, ewa_with_depth
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import ORDERS, Approximations
 from drgs.core.arrays import Rows, reinterpret, scatter_rows, types_of

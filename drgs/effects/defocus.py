@@ -80,8 +80,8 @@ class DimmedFalloff(GaussianFalloff):
         return replace(self, falloff=self.falloff.bind(lanes, positions))
 
     @override
-    def along(self, camera_tangents: Sequence[Float]) -> DimmedFalloff:
-        return replace(self, falloff=self.falloff.along(camera_tangents))
+    def with_camera_tangents(self, camera_tangents: Sequence[Float]) -> DimmedFalloff:
+        return replace(self, falloff=self.falloff.with_camera_tangents(camera_tangents))
 
     @override
     def log2_opacity(self, geometry: list[Float]) -> Float:

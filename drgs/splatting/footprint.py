@@ -242,7 +242,7 @@ class GaussianFalloff:
         del lanes, positions
         return self
 
-    def along(self, camera_tangents: Sequence[Float]) -> GaussianFalloff:
+    def with_camera_tangents(self, camera_tangents: Sequence[Float]) -> GaussianFalloff:
         """Return the falloff whose :meth:`tangent` includes that of the camera's rays.
 
         camera_tangents: of ``camera.numbers()``. Here, alpha depends on splats alone.

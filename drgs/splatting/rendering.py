@@ -219,17 +219,17 @@ def _rays_adjoint(frames: list[Frame], d_planes: list[list[Float]]) -> list[Floa
         tangents = [dr.opaque(t.Float, float(number == k)) for k in range(count)]
         total = dr.zeros(t.Float)
         for frame, of_frame in zip(frames, d_planes, strict=True):
-            planes = frame.order.tangent(_along(frame.tiles, tangents), still)
+            planes = frame.order.tangent(_with_camera_tangents(frame.tiles, tangents), still)
             products = (a * b for a, b in zip(planes, of_frame, strict=True))
             total = sum((dr.sum(product) for product in products), total)
         totals.append(total)
     return totals
 
 
-def _along(tiles: CompositedTiles, camera_tangents: list[Float]) -> CompositedTiles:
+def _with_camera_tangents(tiles: CompositedTiles, camera_tangents: list[Float]) -> CompositedTiles:
     """Return the tiles, whose tangent includes that of the camera's rays."""
     model = tiles.bins.model
-    model = replace(model, falloff=model.falloff.along(camera_tangents))
+    model = replace(model, falloff=model.falloff.with_camera_tangents(camera_tangents))
     return replace(tiles, bins=replace(tiles.bins, model=model))
 
 
@@ -420,7 +420,7 @@ def frames_tangent(
     direction = SplatGradients(geometry=columns[:count], features=columns[count:])
     tiles = [frame.tiles for frame in frames]
     if camera_tangents is not None:
-        tiles = [_along(each, camera_tangents) for each in tiles]
+        tiles = [_with_camera_tangents(each, camera_tangents) for each in tiles]
     return [frame.order.tangent(each, direction) for frame, each in zip(frames, tiles, strict=True)]
 
 

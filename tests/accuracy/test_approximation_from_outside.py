@@ -11,7 +11,7 @@ import pytest
 from support.small_fits import plain_dataset
 from support.viewer_rendering import VIEWER_RENDERING
 
-from drgs.accuracy.exact import ewa_with_depth
+from drgs.accuracy.peaks import ewa_with_depth
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
