@@ -23,11 +23,12 @@ from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.summary import format_effects, summary_of_sensors, summary_of_views
 
 MODULES = """
-    accuracy.exact accuracy.pixel_order accuracy.ray_colors accuracy.unscented
-    cameras.distortion cameras.fisheye cameras.motion cameras.orthographic cameras.radial_tangential
-    cameras.thin_prism_fisheye effects.defocus effects.occlusion effects.smoothing
-    gaussians.rotation gaussians.similarity integrator.parts integrator.light.splat_transport
-    integrator.light.shadows integrator.light.surfaces light light.grid light.probe light.walk
+    accuracy.exact accuracy.lens_rays accuracy.peaks accuracy.pixel_order accuracy.ray_colors
+    accuracy.unscented cameras.distortion cameras.fisheye cameras.motion cameras.orthographic
+    cameras.radial_tangential cameras.thin_prism_fisheye effects.defocus effects.occlusion
+    effects.rolling_shutter effects.smoothing gaussians.rotation gaussians.similarity
+    integrator.parts integrator.light.splat_transport integrator.light.shadows
+    integrator.light.surfaces light light.grid light.probe light.walk
 """
 """Modules used only by effects of images; a fit asks every effect whether it takes part."""
 
@@ -240,6 +241,7 @@ def show(objects=(), kind="perspective", sensor=(), **settings):
     mi.render(mi.load_dict(scene), spp=1)
 
 aperture = {{"aperture_radius": 0.1, "focus_distance": 2.0}}
+rolling = {{"shutter": "rolling", "to_world_close": mi.ScalarTransform4f().translate([0.1, 0, 0])}}
 sky = {{"sky": {{"type": "constant"}}}}
 lit = {{**sky, "ball": {{"type": "sphere"}}}}
 capture.blobs().save({ply!r})
@@ -258,13 +260,17 @@ STEPS = {
     "show(light='none')": "",
     "show(light='rays')": "",  # without surfaces
     "show(sky)": "",
-    "show(projection='exact')": "accuracy.exact",
+    "show(projection='exact')": "accuracy.exact accuracy.peaks",
     "show(projection='unscented')": "accuracy.unscented",
     "show(order='pixel')": "accuracy.pixel_order",
     "show(sh_direction='pixel')": "accuracy.ray_colors",
     "show(kind='calibrated', sensor={'lens': 'opencv', 'k1': 0.1})": (
         "cameras.distortion cameras.radial_tangential"
     ),
+    "show(kind='calibrated', sensor={'lens': 'opencv', 'k1': 0.1}, projection='exact')": (
+        "accuracy.lens_rays"
+    ),
+    "show(kind='calibrated', sensor=rolling)": "effects.rolling_shutter",
     "show(kind='thinlens', sensor=aperture)": "effects.defocus",
     "show(kind='orthographic')": "cameras.orthographic",
     "show(lit, light='none')": "effects.occlusion integrator.light.surfaces",
