@@ -200,9 +200,10 @@ def render_along(
     gaussians: Gaussians,
     origins: np.ndarray,
     directions: np.ndarray,
-    colors: np.ndarray,
+    colors: np.ndarray | None = None,
     widening: np.ndarray | float = 0.0,
     centers: np.ndarray | None = None,
+    far: ArrayLike = inf,
     background: ArrayLike = (0.0, 0.0, 0.0),
     model: ImageModel = DEFAULT_MODEL,
     threshold_width: float = reference.THRESHOLD_WIDTH,
@@ -212,8 +213,9 @@ def render_along(
     A Gaussian's response to a ray is that of its peak along it, ``ImageModel.projection`` exact.
 
     origins, directions: (H, W, 3) world, depth grows by 1 along a direction; NaN: no ray. colors:
-    (N, 3), display space. widening: (N, 3, 3) added to the covariances, world. centers: (N,) depths
-    of the means, by which splats are sorted; None: by the depths of their peaks.
+    (N, 3), display space; None: along each ray. widening: (N, 3, 3) added to the covariances,
+    world. centers: (N,) depths of the means, by which splats are sorted; None: by the depths of
+    their peaks. far: (H, W) depths from which on nothing is seen.
 
     With W W^T = S^-1, m = W^T (mean - origin), v = W^T direction: the peak is at t = m . v / |v|^2,
     and rho^2 = |m x v|^2 / |v|^2.
@@ -234,11 +236,16 @@ def render_along(
     t = np.sum(m * v, axis=-1) / squared
     rho_sq = np.sum(np.cross(m, v) ** 2, axis=-1) / squared
     keys = t if centers is None else np.broadcast_to(centers, t.shape)
-    peaks = _Peaks(rho_sq, keys, keys, t)
+    is_before = t < np.broadcast_to(far, (height, width)).reshape(-1, 1)
+    peaks = _Peaks(rho_sq, keys, keys, np.where(is_before, t, -inf))
     opacities = reference.sigmoid(gaussians.logit_opacities)
-    splats = cast(_Splats, SimpleNamespace(opacities=opacities))
+    splats = cast(_Splats, SimpleNamespace(opacities=opacities, sh=gaussians.sh))
     weights, behind, marks = _composite(splats, peaks, np.zeros(len(t)), model, threshold_width)
-    image = (weights @ colors + behind[:, None] * background).reshape(height, width, 3)
+    if colors is None:
+        seen = _colors_along(splats, directions.reshape(-1, 3), weights)
+    else:
+        seen = weights @ colors
+    image = (seen + behind[:, None] * background).reshape(height, width, 3)
     depth = np.sum(weights * keys, axis=1).reshape(height, width)
     behind = behind.reshape(height, width)
     return RenderedImage(image, 1 - behind, depth, behind, marks.reshape(height, width))
