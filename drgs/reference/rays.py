@@ -229,9 +229,11 @@ def render_along(
     else:
         scales = np.exp(gaussians.log_scales)[:, :, None]
         whitening = np.swapaxes(rotations, 1, 2) / scales
-    offsets = gaussians.means - origins.reshape(-1, 1, 3)
-    m = np.einsum("nij,pnj->pni", whitening, offsets)
-    v = np.einsum("nij,pj->pni", whitening, np.nan_to_num(directions).reshape(-1, 3))
+    rows = whitening.reshape(-1, 3).T
+    start = np.nan_to_num(origins).reshape(-1, 3)
+    means = np.einsum("nij,nj->ni", whitening, gaussians.means - start[0])
+    m = means - ((start - start[0]) @ rows).reshape(len(start), -1, 3)
+    v = (np.nan_to_num(directions).reshape(-1, 3) @ rows).reshape(len(start), -1, 3)
     squared = np.maximum(np.sum(v**2, axis=-1), 1e-300)
     t = np.sum(m * v, axis=-1) / squared
     rho_sq = np.sum(np.cross(m, v) ** 2, axis=-1) / squared

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 BUDGETS = (0.03, 0.015, 0.008, 0.004, 0.002)
 NUM_VIEWS, NUM_JUDGED = 24, 6
-NUM_POINTS = 64  # of an aperture, or times of an open shutter
+NUM_POINTS = 32  # of an aperture, or times of an open shutter
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 NO_CUTS = rays.ImageModel(
     projection="exact", order="pixel", sh_direction="pixel", low_pass=0.0, alpha_cut=0.0,
