@@ -50,6 +50,17 @@ class Aperture:
         ray = ray * self.focus_distance - begin * self.radius
         return camera.rotation.T @ ray, seen
 
+    def cameras(self, camera: Camera, count: int) -> list[Camera]:
+        """Return pinholes all over the aperture; the mean of their images is that of the lens."""
+        cameras, t = [], types_of(type(camera.near))
+        for x, y in _disc(count).T.tolist():
+            begin = self.radius * t.Array3f(x, y, 0)
+            shift = t.Array2f(begin.x, begin.y) * camera.focal / self.focus_distance
+            center = camera.center + camera.rotation.T @ begin
+            pinhole = replace(camera, center=center, principal=camera.principal + shift)
+            cameras.append(replace(pinhole, aperture=None))
+        return cameras
+
     def in_focus(self, origin: Array3f, direction: Array3f) -> Array3f:
         """Return the point of a ray (camera axes) where all rays of its place meet."""
         t = (self.focus_distance - origin.z) / direction.z

@@ -60,6 +60,24 @@ def test_zero_aperture_renders_the_pinhole_image(precision):
 
 
 @both_precisions
+def test_cameras_of_an_aperture_are_the_reference(precision):
+    """Points are seen at the same places: those in focus at one, others all over their blur."""
+    camera = camera_at_origin(fx=200.0, fy=180.0)
+    device = aperture_camera(camera, precision, DEFOCUS)
+    points = np.array([[0.25, -0.125, 0.5], [0.5, 0.25, 2.0], [-1.0, 0.5, 8.0]])
+    found = [
+        rows(at.lens.project_point(at, at.rotation @ (precision.vectors(points) - at.center)))
+        for at in device.aperture.cameras(device, 16)
+    ]
+    expected = [
+        at.film_points((points - at.center) @ at.rotation.T)
+        for at in lens_cameras(camera, DEFOCUS, 16)
+    ]
+    np.testing.assert_allclose(found, expected, rtol={FLOAT64: 1e-12}.get(precision, 2e-6))
+    np.testing.assert_allclose(np.ptp(found, axis=0)[1], 0, atol=1e-3)
+
+
+@both_precisions
 def test_splat_in_focus_is_not_blurred(precision):
     """Nor dimmed; those before and behind it are."""
     camera = camera_at_origin(fx=200.0, fy=200.0)
