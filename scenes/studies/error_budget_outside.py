@@ -177,7 +177,8 @@ class Kind:
         hit = np.abs(origins + t[..., None] * directions)[..., :2].max(axis=-1) <= 1.5
         far = np.where((t > 0) & hit, t, np.inf)
         shown = rays.render_along(gaussians, origins, directions, far=far, model=NO_CUTS)
-        behind = np.where(np.isfinite(far), 0.6, 1.0)[..., None]
+        lamp = np.where(origins[..., 2] > self.wall, 0.6, 0.0)  # dark from below
+        behind = np.where(np.isfinite(far), lamp, 1.0)[..., None]
         alpha = shown.alpha[..., None]
         linear = alpha * linear_of(shown.image / np.where(alpha > 0, alpha, 1))
         return display_of(linear + (1 - alpha) * behind)
