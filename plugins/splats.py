@@ -359,13 +359,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
             from drgs.integrator.light.shadows import shade
 
             shade(self.state, scene)
-        if self.state.error is not None and self.state.budget_report is None:
-            from drgs.integrator.error_budget import meet_error_budget
+        if self.state.error is not None:
+            from drgs.integrator.error_budget import keep_error_budget
 
-            alone = self.state.cache.sensor
-            if sensors := scene.sensors() or ([] if alone is None else [alone]):
-                report = meet_error_budget(self.state, sensors, self.state.error)
-                mi.Log(mi.LogLevel.Info, report.line())  # pyright: ignore[reportCallIssue]  no type
+            keep_error_budget(self.state, scene)
 
 
 mi.register_integrator("splats", lambda props: SplatsIntegrator(props))

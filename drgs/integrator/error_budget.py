@@ -1,24 +1,49 @@
-"""Error budgets of the integrator ``splats``: cameras of sensors, images for the search."""
+"""Error budgets of the integrator ``splats``: images for the search, and what its choice rests on.
+
+Images are the integrator's own: with an environment, a texture or surfaces behind the splats, and
+with light between them. Surfaces have the radiance of a few paths per pixel, the same in all images
+unless it depends on the splats: its noise adds to errors, and hides none.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.accuracy.error_budget import BudgetReport, Renderer, Search
+from drgs.accuracy.error_budget import (
+    SAMPLES,
+    BudgetReport,
+    Choice,
+    Renderer,
+    Search,
+    Window,
+    crop,
+)
 from drgs.accuracy.pipeline import pipeline_of
-from drgs.cameras.camera import Camera
+from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.config.approximations import Approximations
-from drgs.core.errors import PluginError
-from drgs.core.types import Float
+from drgs.core.arrays import types_of
+from drgs.core.errors import PluginError, format_names
+from drgs.core.private import same_variables
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.film import FilmWindow, pixel_corners
+from drgs.integrator.image_render import SensorRender, constant_background, nested_surfaces
 from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
 from drgs.integrator.state import SplatsState
+from drgs.light.walk import RaySplats, Segment
 from drgs.splatting import rendering
+from drgs.splatting.footprint import PixelCenters
+from drgs.splatting.projection import load_rows
+
+PATHS = 16  # per pixel, of the radiance of surfaces
+RESIDUAL_PX = 48  # side of the part of a window in which rays are traced
+LARGE = 0.25  # standard deviation of a splat relative to its depth, whose order is hard to find
 
 
 def renderer_of(
@@ -29,40 +54,245 @@ def renderer_of(
 ) -> Renderer:
     """Return the renderer of Gaussians on the device, over a background in display space."""
 
-    def planes(camera: Camera, approximations: Approximations) -> list[Float]:
-        with dr.suspend_grad():
-            pipeline = with_effects(pipeline_of(approximations, sh_degree), gaussians, camera)
-            planes = rendering.render(gaussians, camera, pipeline).planes()
-            dr.eval(planes)
-        return planes
+    def draw(
+        camera: Camera, window: Window | None, approximations: Approximations, samples: int
+    ) -> np.ndarray:
+        images, color = [], np.array(background, np.float32)
+        camera = camera if window is None else crop(camera, *window)
+        for one in cameras_in_time(camera, samples):
+            with dr.suspend_grad():
+                pipeline = with_effects(pipeline_of(approximations, sh_degree), gaussians, one)
+                planes = rendering.render(gaussians, one, pipeline).planes()
+                dr.eval(planes)
+            transmittance, *colors = (np.array(plane) for plane in planes)
+            images.append(np.stack(colors, axis=-1) + transmittance[:, None] * color)
+        return np.mean(images, axis=0).reshape(camera.height, camera.width, 3)
 
-    return Renderer(planes, given, background)
+    return Renderer(draw, given, partial(ray_residual, gaussians, sh_degree))
+
+
+def ray_residual(
+    gaussians: Gaussians,
+    sh_degree: int,
+    camera: Camera,
+    window: Window | None,
+    approximations: Approximations,
+) -> float:
+    """Return the mean square difference between an image and exact colours along its rays.
+
+    Rays composite all Gaussians in the order of their peaks (:mod:`drgs.light.walk`); both are
+    without a low-pass filter, which rays do not have, and the background is black or white. 0 where
+    no visible Gaussian is :data:`LARGE`, and for cameras that blur.
+    """
+    if camera.aperture is not None or camera.shutter is not None:
+        return 0.0
+    rows, t = load_rows(gaussians, sh_degree), types_of(type(camera.near))
+    depth = (camera.rotation @ (rows.means - camera.center)).z
+    visible = depth > camera.near
+    if not dr.any(visible & (dr.exp(dr.max(rows.log_scales)) > LARGE * depth)):
+        return 0.0
+    x, y, width, height = window or (0, 0, camera.width, camera.height)
+    left, top = (max(size - RESIDUAL_PX, 0) // 2 for size in (width, height))
+    size = min(width, RESIDUAL_PX), min(height, RESIDUAL_PX)
+    camera = crop(camera, x + left, y + top, *size)
+    pipeline = pipeline_of(replace(approximations, low_pass=0.0), sh_degree)
+    pipeline = with_effects(pipeline, gaussians, camera)
+    rows = pipeline.rows(rows)
+    rows = replace(rows, logit_opacities=dr.select(visible, rows.logit_opacities, -dr.inf))
+    pixel = dr.arange(t.UInt32, size[0] * size[1])
+    row = pixel // size[0]
+    origin, towards, seen = camera.look_through(
+        t.Float(pixel - row * size[0]) + 0.5, t.Float(row) + 0.5
+    )
+    to_world, splats = (
+        camera.rotation.T,
+        RaySplats.from_gaussians(rows, sh_degree, pipeline.model.cutoffs),
+    )
+    color, rest = splats.composite_segment(
+        Segment(
+            camera.center + to_world @ origin,
+            dr.normalize(to_world @ towards),
+            dr.full(t.Float, dr.inf, dr.width(pixel)),
+            dr.full(t.Bool, True, dr.width(pixel)) & seen,
+        )
+    )
+    planes = rendering.render(gaussians, camera, pipeline).planes()
+    exact = np.array([np.array(plane) for plane in (rest, *color)], np.float64)
+    rest, *color = np.array([np.array(plane) for plane in planes]) - exact
+    return max(float(np.mean(np.square(color + white * rest))) for white in (0, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _SceneRenderer:
+    """Renders views of a scene in display space; see :attr:`.Renderer.draw`."""
+
+    splats: SplatsState  # a copy with a cache of its own
+    scene: mi.Scene
+    views: list[tuple[Camera, mi.Sensor]]
+
+    def draw(
+        self, camera: Camera, window: Window | None, approximations: Approximations, samples: int
+    ) -> np.ndarray:
+        """Render a view or its window."""
+        number = next(k for k, (one, _) in enumerate(self.views) if one is camera)
+        sensor, splats = self.views[number][1], self.splats
+        splats.budget_report = BudgetReport(
+            0.0, Choice(approximations, {SAMPLES: samples}, 0.0, 0.0), (), None, None
+        )
+        film, place = sensor.film(), f"{number} {window}"
+        x, y, width, height = window or (0, 0, camera.width, camera.height)
+        offset = film.crop_offset()
+        part = FilmWindow(tuple(film.size()), (offset[0] + x, offset[1] + y), (width, height))
+        view = SensorRender(
+            splats=splats,
+            scene=self.scene,
+            index=splats.cache.find(f"index {place}", (), (), lambda: len(splats.cache.kept)).value,
+            sensor=sensor,
+            positions=(PixelCenters(),),
+            key=None,
+            has_alpha=False,
+            nested=nested_surfaces(splats, self.scene, sensor, 0, 0),
+            window=part,
+        )
+        if view.nested is not None:
+            nested = view.nested.with_surfaces(view.num_surfaces(view.nested))
+            view = replace(view, nested=nested)
+        (channels,) = view.channels(view.planes(), constant_background(splats))
+        color = channels[:3]
+        if view.nested is not None:
+            compositor, own = view.nested.compositor, channels[3:]
+            behind = own[2 * compositor.num_surfaces :] or [mi.Float(0)] * 3
+            images = [*map(list, self._radiances(view, place)), behind]
+            shown = compositor.visible_radiance(own, images)
+            color = [s + c for s, c in zip(shown, color, strict=True)]
+        image = mi.Color3f(color)
+        if splats.srgb_primitives:
+            image = mi.math.linear_to_srgb(image)
+        splats.cache.forget("frames")
+        return np.array(image).T.reshape(height, width, 3)
+
+    def _radiances(self, view: SensorRender, place: str) -> list[mi.Color3f]:
+        """Return the nested images N_0, N_1, ... of a view, linear."""
+        film, nested, part = view.sensor.film(), view.nested, view.film
+        assert nested is not None, "rendered where there are surfaces"
+        count = int(dr.prod(part.crop_size()))
+        lit = None if self.splats.lighting.light == "none" else self.splats.approximations
+
+        def trace() -> list[mi.Color3f]:
+            sampler = mi.load_dict({"type": "independent"})
+            sampler.seed(0, count * PATHS)
+            corner = dr.repeat(pixel_corners(part), PATHS)
+            offset = mi.Vector2f(part.crop_offset()) - mi.Vector2f(film.crop_offset())
+            point = (corner + offset + sampler.next_2d()) / mi.Vector2f(film.crop_size())
+            sensor = view.sensor
+            time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
+            ray, weight = sensor.sample_ray_differential(
+                time, sampler.next_1d(), point, sampler.next_2d()
+            )
+            images = [
+                mi.Color3f([dr.block_sum(c, PATHS) / PATHS for c in weight * image])
+                for image in nested.radiances(ray, sampler, mi.Bool(True))
+            ]
+            dr.eval(images)
+            return images
+
+        settings = lit, nested.surfaces, nested.compositor.num_surfaces
+        return self.splats.cache.find(f"nested {place}", settings, (), trace).value
 
 
 def meet_error_budget(
-    splats: SplatsState, sensors: Sequence[mi.Sensor], budget: float
+    splats: SplatsState, scene: mi.Scene, sensors: Sequence[mi.Sensor], budget: float
 ) -> BudgetReport:
     """Set the cheapest approximations whose images are within ``budget``; return what was found.
 
-    sensors: those that are to be rendered. Surfaces and films' filters are left out of what is
-    measured, and a textured background is black. Raises :class:`PluginError` if the budget cannot
-    be met.
+    sensors: those that are to be rendered. Films' filters and AOVs are left out of what is
+    measured. Raises :class:`PluginError` if the budget cannot be met.
     """
     alone = [one for sensor in sensors for one in sensors_of(sensor)]
-    cameras = [
-        without_effects(camera_from_sensor(read_sensor(one, splats.near)), splats.ignore)
-        for one in alone
-    ]
-    background = (0.0, 0.0, 0.0)
-    if not isinstance(splats.background, mi.Texture):
-        red, green, blue = (float(v) for v in np.array(dr.detach(splats.background)).ravel())
-        background = red, green, blue
+    cache = replace(splats.cache, kept={})
     try:
         with dr.suspend_grad():
-            gaussians, given = dr.detach(splats.gaussians), splats.given_approximations
-            renderer = renderer_of(gaussians, given, splats.sh_degree, background)
+            cameras = [
+                without_effects(camera_from_sensor(read_sensor(one, splats.near)), splats.ignore)
+                for one in alone
+            ]
+            copy = replace(splats, aovs={}, cache=cache, projected_view=None)
+            drawer = _SceneRenderer(copy, scene, list(zip(cameras, alone, strict=True)))
+            residual = partial(ray_residual, dr.detach(copy.gaussians), copy.sh_degree)
+            renderer = Renderer(drawer.draw, splats.given_approximations, residual)
             report = Search(renderer, cameras).choose(budget)
     except ValueError as error:
         raise PluginError(f"splats: error {error}") from None
     splats.budget_report = report
     return report
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What a choice was measured on; held, so that equal indices mean equal values."""
+
+    parameters: dict[str, object]  # of the scene, detached
+    sensors: list[tuple[mi.Sensor, list[object]]]  # with the state of their cameras, on the host
+
+    @staticmethod
+    def collect(scene: mi.Scene, sensors: Sequence[mi.Sensor], near: float) -> Evidence:
+        """Collect what images of the sensors depend on."""
+        return Evidence(_parameters(scene), [(one, _camera_values(one, near)) for one in sensors])
+
+    def changes(self, scene: mi.Scene, sensor: mi.Sensor | None, near: float) -> list[str]:
+        """Return the names of what is another now; sensor: the one that is rendered."""
+        now = _parameters(scene)
+        names = sorted(
+            name
+            for name in now.keys() | self.parameters.keys()
+            if not _is_same(now.get(name), self.parameters.get(name))
+        )
+        if sensor is None or any(sensor is one for one, _ in self.sensors):
+            return names
+        values = _camera_values(sensor, near)
+        return names if any(values == one for _, one in self.sensors) else [*names, "the sensor"]
+
+
+def _parameters(scene: mi.Scene) -> dict[str, object]:
+    params = mi.traverse(scene)
+    found = {}
+    for name, (value, kind, node, _) in params.properties.items():
+        found[name] = value if kind is None else mi.get_property(value, kind, node)
+    return dr.detach(found)
+
+
+def _is_same(one: object, other: object) -> bool:
+    if dr.is_array_v(one) and dr.is_array_v(other) and dr.is_jit_v(one):
+        return same_variables(one, other)
+    return type(one) is type(other) and bool(np.all(one == other))
+
+
+def _camera_values(sensor: mi.Sensor, near: float) -> list[object]:
+    states = [read_sensor(one, near).detach() for one in sensors_of(sensor)]
+    return [[s.host, {k: np.array(v).tolist() for k, v in s.device.items()}] for s in states]
+
+
+def keep_error_budget(splats: SplatsState, scene: mi.Scene) -> None:
+    """Choose approximations for the error budget once; then mark the choice where it is stale.
+
+    A choice is kept when Gaussians, sensors or anything else change, as they do in each step of an
+    optimisation; the first change is logged, and recorded in ``budget_report``.
+    """
+    alone, report = splats.cache.sensor, splats.budget_report
+    sensors = scene.sensors() or ([] if alone is None else [alone])
+    if splats.given_error is None or not sensors:
+        return
+    if report is None:
+        report = meet_error_budget(splats, scene, sensors, splats.given_error)
+        splats.budget_evidence = Evidence.collect(scene, sensors, splats.near)
+        level, message = mi.LogLevel.Info, report.line()
+    elif report.stale or not (names := splats.budget_evidence.changes(scene, alone, splats.near)):
+        return
+    else:
+        report = splats.budget_report = replace(report, stale=format_names(names))
+        level = mi.LogLevel.Warn
+        message = (
+            f"splats: error {report.budget:.2g}: approximations stay as measured before a change "
+            f"of {report.stale}; set 'error' again to measure anew"
+        )
+    mi.Log(level, message)  # pyright: ignore[reportCallIssue]  no type in the stub

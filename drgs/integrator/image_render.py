@@ -28,6 +28,7 @@ from drgs.integrator.film import (
     CenterSamples,
     Channels,
     DrawnSamples,
+    FilmWindow,
     SamplePoints,
     background_radiance,
     decode,
@@ -231,6 +232,12 @@ class SensorRender:
     key: object  # of the positions: see drgs.integrator.film.CenterSamples
     has_alpha: bool
     nested: NestedSurfaces | None  # the part of surfaces, if there are any
+    window: FilmWindow | None = None  # that is rendered instead of the film's own
+
+    @property
+    def film(self) -> mi.Film | FilmWindow:
+        """The film, or the window of it."""
+        return self.window or self.sensor.film()
 
     def planes(self) -> Planes:
         """Return the planes of all frames, unevaluated."""
@@ -383,7 +390,7 @@ class SensorRender:
         cameras = [of_time[0].camera for of_time in self.frames]
         if state.is_attached:
             cameras = self._attached_cameras(state)
-        colors = radiance = background_radiance(self.sensor.film(), behind, cameras, self._offsets)
+        colors = radiance = background_radiance(self.film, behind, cameras, self._offsets)
         if environment is None or not splats.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Background(colors, environment is not None, radiance)
@@ -449,7 +456,7 @@ class SensorRender:
             lambda: trace_surfaces(
                 nested.rays,
                 far,
-                self.sensor.film(),
+                self.film,
                 self._cameras(state),
                 self._offsets,
                 with_normals="normal" in self.splats.aovs.values(),
@@ -466,7 +473,11 @@ class SensorRender:
         return [(p.x, p.y) if isinstance(p, SamplePoints) else (0.5, 0.5) for p in self.positions]
 
     def _state(self) -> SensorState:
-        return read_sensor(self.sensor, self.splats.near)
+        state = read_sensor(self.sensor, self.splats.near)
+        if self.window is None:
+            return state
+        place = *self.window.size(), *self.window.crop_offset(), *self.window.crop_size()
+        return replace(state, host=(*place, state.host[-1]))
 
     @cached_property
     def _camera_state(self) -> SensorState:

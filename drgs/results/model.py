@@ -33,7 +33,7 @@ from drgs.integrator.scene import (
     make_sensors,
     render_views,
 )
-from drgs.integrator.state import SplatsState, is_splats
+from drgs.integrator.state import is_splats
 from drgs.integrator.summary import format_effects, summary_of_views
 from drgs.io.images import write_png
 from drgs.results.folder import CONFIG, ERROR_BUDGET, GAUSSIANS, relocate_data, require_results
@@ -148,17 +148,18 @@ class Model:
         print(format_effects(summary), flush=True)
         names = [*(f"{view.name}.png" for view in views), *others]
         if self.error is not None:
-            folder.budget = self.meet_error_budget(integrator.state, views)
+            folder.budget = self.meet_error_budget(scene, views)
             names.append(ERROR_BUDGET)
         return folder.claim(names, self.render(scene, views))
 
-    def meet_error_budget(self, splats: SplatsState, views: Sequence[Viewpoint]) -> BudgetReport:
+    def meet_error_budget(self, scene: mi.Scene, views: Sequence[Viewpoint]) -> BudgetReport:
         """Set approximations within the error; print and return what was found."""
         from drgs.integrator.error_budget import meet_error_budget
 
-        assert self.error is not None
+        integrator = scene.integrator()
+        assert self.error is not None and is_splats(integrator), "scene() sets it"
         try:
-            report = meet_error_budget(splats, make_sensors(views), self.error)
+            report = meet_error_budget(integrator.state, scene, make_sensors(views), self.error)
         except PluginError as error:
             raise UserError(f"--{str(error).removeprefix('splats: ')}") from None
         print(report.line(), flush=True)
@@ -166,9 +167,7 @@ class Model:
 
     def within_error(self, error: float, views: Sequence[Viewpoint]) -> Model:
         """Return this with approximations within an error at the views; print what was found."""
-        integrator = self.scene().integrator()
-        assert is_splats(integrator), "scene() sets it"
-        report = replace(self, error=error).meet_error_budget(integrator.state, views)
+        report = replace(self, error=error).meet_error_budget(self.scene(), views)
         return replace(self, settings=self.settings.model_copy(update=report.chosen.changes))
 
     def dataset(self, option: str) -> Dataset:

@@ -17,7 +17,7 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera
 from drgs.core.types import Float
 from drgs.effects.occlusion import Surface
-from drgs.integrator.film import num_samples, pixel_corners
+from drgs.integrator.film import FilmWindow, num_samples, pixel_corners
 from drgs.integrator.light.rays import MAX_INVISIBLE_OPACITY, StraightRays
 
 EDGE_GRID = 4  # rays along each axis of a pixel in which a surface ends
@@ -29,7 +29,7 @@ MISSING_SURFACE_DEPTH = 1e30  # depth of a missing surface: behind all splats, a
 class VisibleSurface(Surface):
     """A visible surface at each pixel."""
 
-    normal: mi.Normal3f | None  # world, times the coverage; None where no AOV needs it
+    normal: mi.Normal3f | None  # world, to the camera, times the coverage; None: no AOV needs it
 
     def gather(self, pixel: mi.UInt32) -> VisibleSurface:
         """Return the surfaces of some pixels."""
@@ -67,7 +67,7 @@ def transmittance_behind(surfaces: Sequence[Surface]) -> mi.Float:
 def trace_surfaces(
     rays: StraightRays,
     far: float,
-    film: mi.Film,
+    film: mi.Film | FilmWindow,
     cameras: Sequence[Camera],
     within: Sequence[tuple[Float | float, Float | float]],
     with_normals: bool,
@@ -151,11 +151,12 @@ class _Tracer:
         normal = None
         if self.with_normals:
             frame = hit.compute_surface_interaction(ray, mi.RayFlags.ShadingFrame, valid).sh_frame
-            normal = dr.select(valid, coverage * mi.Normal3f(frame.n), 0)
+            towards = dr.select(dr.dot(frame.n, ray.d) > 0, -frame.n, frame.n)
+            normal = dr.select(valid, coverage * mi.Normal3f(towards), 0)
         return VisibleSurface(dr.select(valid, depth, MISSING_SURFACE_DEPTH), coverage, normal)
 
     def trace_with_edges(
-        self, camera: Camera, film: mi.Film, x: Float | float, y: Float | float
+        self, camera: Camera, film: mi.Film | FilmWindow, x: Float | float, y: Float | float
     ) -> SurfaceLayers:
         """Trace at one place of each pixel, or at several where coverage differs in its neighbours.
 
