@@ -7,6 +7,7 @@ unless it depends on the splats: its noise adds to errors, and hides none.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+import drgs
 from drgs.accuracy.error_budget import (
     SAMPLES,
     BudgetReport,
@@ -32,8 +34,9 @@ from drgs.core.errors import PluginError, format_names
 from drgs.core.private import same_variables
 from drgs.effects.compose import with_effects, without_effects
 from drgs.gaussians.parameters import Gaussians
-from drgs.integrator.film import FilmWindow, pixel_corners
+from drgs.integrator.film import pixel_corners
 from drgs.integrator.image_render import SensorRender, constant_background, nested_surfaces
+from drgs.integrator.light.derivatives import parameter_value
 from drgs.integrator.sensors import camera_from_sensor, read_sensor, sensors_of
 from drgs.integrator.state import SplatsState
 from drgs.light.walk import RaySplats, Segment
@@ -69,6 +72,15 @@ def renderer_of(
         return np.mean(images, axis=0).reshape(camera.height, camera.width, 3)
 
     return Renderer(draw, given, partial(ray_residual, gaussians, sh_degree))
+
+
+def cropped_film(film: mi.Film, corner: Sequence[int], width: int, height: int) -> mi.Film:
+    """Return a film of the same size with another crop window, px."""
+    size = dict(zip(("width", "height"), map(int, film.size()), strict=True))
+    crop = dict(zip(("crop_offset_x", "crop_offset_y"), map(int, corner), strict=True))
+    return mi.load_dict(
+        {"type": "hdrfilm", **size, **crop, "crop_width": width, "crop_height": height}
+    )
 
 
 def ray_residual(
@@ -134,69 +146,60 @@ class _SceneRenderer:
         self, camera: Camera, window: Window | None, approximations: Approximations, samples: int
     ) -> np.ndarray:
         """Render a view or its window."""
-        number = next(k for k, (one, _) in enumerate(self.views) if one is camera)
-        sensor, splats = self.views[number][1], self.splats
-        splats.budget_report = BudgetReport(
-            0.0, Choice(approximations, {SAMPLES: samples}, 0.0, 0.0), (), None, None
-        )
-        film, place = sensor.film(), f"{number} {window}"
+        sensor = next(sensor for one, sensor in self.views if one is camera)
+        splats, cache = self.splats, self.splats.cache
+        choice = Choice(approximations, {SAMPLES: samples}, 0.0, 0.0)
+        splats.budget_report = BudgetReport(0.0, choice, (), None, None)
         x, y, width, height = window or (0, 0, camera.width, camera.height)
-        offset = film.crop_offset()
-        part = FilmWindow(tuple(film.size()), (offset[0] + x, offset[1] + y), (width, height))
+        film, place = sensor.film(), f"{id(camera)} {window}"
         view = SensorRender(
             splats=splats,
             scene=self.scene,
-            index=splats.cache.find(f"index {place}", (), (), lambda: len(splats.cache.kept)).value,
+            index=cache.find(f"number of {place}", (), (), lambda: len(cache.kept)).value,
             sensor=sensor,
             positions=(PixelCenters(),),
             key=None,
             has_alpha=False,
             nested=nested_surfaces(splats, self.scene, sensor, 0, 0),
-            window=part,
+            window=cropped_film(film, film.crop_offset() + mi.ScalarVector2u(x, y), width, height),
         )
         if view.nested is not None:
-            nested = view.nested.with_surfaces(view.num_surfaces(view.nested))
-            view = replace(view, nested=nested)
+            count = view.num_surfaces(view.nested)
+            view = replace(view, nested=view.nested.with_surfaces(count))
         (channels,) = view.channels(view.planes(), constant_background(splats))
-        color = channels[:3]
+        cache.forget("frames")
+        color, own = mi.Color3f(channels[:3]), channels[3:]
         if view.nested is not None:
-            compositor, own = view.nested.compositor, channels[3:]
+            compositor = view.nested.compositor
             behind = own[2 * compositor.num_surfaces :] or [mi.Float(0)] * 3
-            images = [*map(list, self._radiances(view, place)), behind]
-            shown = compositor.visible_radiance(own, images)
-            color = [s + c for s, c in zip(shown, color, strict=True)]
-        image = mi.Color3f(color)
+            images = [*self._nested_images(view, place), behind]
+            color += mi.Color3f(compositor.visible_radiance(own, images))
         if splats.srgb_primitives:
-            image = mi.math.linear_to_srgb(image)
-        splats.cache.forget("frames")
-        return np.array(image).T.reshape(height, width, 3)
+            color = mi.math.linear_to_srgb(color)
+        return np.array(color).T.reshape(height, width, 3)
 
-    def _radiances(self, view: SensorRender, place: str) -> list[mi.Color3f]:
+    def _nested_images(self, view: SensorRender, place: str) -> list[list[mi.Float]]:
         """Return the nested images N_0, N_1, ... of a view, linear."""
-        film, nested, part = view.sensor.film(), view.nested, view.film
-        assert nested is not None, "rendered where there are surfaces"
-        count = int(dr.prod(part.crop_size()))
-        lit = None if self.splats.lighting.light == "none" else self.splats.approximations
+        sensor, nested, part = view.sensor, view.nested, view.window
+        assert nested is not None and part is not None, "rendered where there are surfaces"
+        is_lit = self.splats.lighting.light != "none"
 
-        def trace() -> list[mi.Color3f]:
-            sampler = mi.load_dict({"type": "independent"})
-            sampler.seed(0, count * PATHS)
-            corner = dr.repeat(pixel_corners(part), PATHS)
-            offset = mi.Vector2f(part.crop_offset()) - mi.Vector2f(film.crop_offset())
-            point = (corner + offset + sampler.next_2d()) / mi.Vector2f(film.crop_size())
-            sensor = view.sensor
+        def trace() -> list[list[mi.Float]]:
+            sampler, film = mi.load_dict({"type": "independent"}), sensor.film()
+            sampler.seed(0, int(dr.prod(part.crop_size())) * PATHS)
+            corner = mi.Vector2f(part.crop_offset()) - mi.Vector2f(film.crop_offset())
+            corner += dr.repeat(pixel_corners(part), PATHS)
+            point = mi.Point2f(corner + sampler.next_2d()) / mi.Vector2f(film.crop_size())
             time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
             ray, weight = sensor.sample_ray_differential(
                 time, sampler.next_1d(), point, sampler.next_2d()
             )
-            images = [
-                mi.Color3f([dr.block_sum(c, PATHS) / PATHS for c in weight * image])
-                for image in nested.radiances(ray, sampler, mi.Bool(True))
-            ]
+            images = nested.radiances(ray, sampler, mi.Bool(True))
+            images = [[dr.block_sum(c, PATHS) / PATHS for c in weight * one] for one in images]
             dr.eval(images)
             return images
 
-        settings = lit, nested.surfaces, nested.compositor.num_surfaces
+        settings = is_lit and self.splats.approximations, nested.surfaces
         return self.splats.cache.find(f"nested {place}", settings, (), trace).value
 
 
@@ -209,67 +212,20 @@ def meet_error_budget(
     measured. Raises :class:`PluginError` if the budget cannot be met.
     """
     alone = [one for sensor in sensors for one in sensors_of(sensor)]
-    cache = replace(splats.cache, kept={})
+    copy = replace(splats, aovs={}, cache=replace(splats.cache, kept={}), projected_view=None)
     try:
         with dr.suspend_grad():
             cameras = [
                 without_effects(camera_from_sensor(read_sensor(one, splats.near)), splats.ignore)
                 for one in alone
             ]
-            copy = replace(splats, aovs={}, cache=cache, projected_view=None)
             drawer = _SceneRenderer(copy, scene, list(zip(cameras, alone, strict=True)))
             residual = partial(ray_residual, dr.detach(copy.gaussians), copy.sh_degree)
             renderer = Renderer(drawer.draw, splats.given_approximations, residual)
-            report = Search(renderer, cameras).choose(budget)
+            report = splats.budget_report = Search(renderer, cameras).choose(budget)
     except ValueError as error:
         raise PluginError(f"splats: error {error}") from None
-    splats.budget_report = report
     return report
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """What a choice was measured on; held, so that equal indices mean equal values."""
-
-    parameters: dict[str, object]  # of the scene, detached
-    sensors: list[tuple[mi.Sensor, list[object]]]  # with the state of their cameras, on the host
-
-    @staticmethod
-    def collect(scene: mi.Scene, sensors: Sequence[mi.Sensor], near: float) -> Evidence:
-        """Collect what images of the sensors depend on."""
-        return Evidence(_parameters(scene), [(one, _camera_values(one, near)) for one in sensors])
-
-    def changes(self, scene: mi.Scene, sensor: mi.Sensor | None, near: float) -> list[str]:
-        """Return the names of what is another now; sensor: the one that is rendered."""
-        now = _parameters(scene)
-        names = sorted(
-            name
-            for name in now.keys() | self.parameters.keys()
-            if not _is_same(now.get(name), self.parameters.get(name))
-        )
-        if sensor is None or any(sensor is one for one, _ in self.sensors):
-            return names
-        values = _camera_values(sensor, near)
-        return names if any(values == one for _, one in self.sensors) else [*names, "the sensor"]
-
-
-def _parameters(scene: mi.Scene) -> dict[str, object]:
-    params = mi.traverse(scene)
-    found = {}
-    for name, (value, kind, node, _) in params.properties.items():
-        found[name] = value if kind is None else mi.get_property(value, kind, node)
-    return dr.detach(found)
-
-
-def _is_same(one: object, other: object) -> bool:
-    if dr.is_array_v(one) and dr.is_array_v(other) and dr.is_jit_v(one):
-        return same_variables(one, other)
-    return type(one) is type(other) and bool(np.all(one == other))
-
-
-def _camera_values(sensor: mi.Sensor, near: float) -> list[object]:
-    states = [read_sensor(one, near).detach() for one in sensors_of(sensor)]
-    return [[s.host, {k: np.array(v).tolist() for k, v in s.device.items()}] for s in states]
 
 
 def keep_error_budget(splats: SplatsState, scene: mi.Scene) -> None:
@@ -278,21 +234,56 @@ def keep_error_budget(splats: SplatsState, scene: mi.Scene) -> None:
     A choice is kept when Gaussians, sensors or anything else change, as they do in each step of an
     optimisation; the first change is logged, and recorded in ``budget_report``.
     """
-    alone, report = splats.cache.sensor, splats.budget_report
-    sensors = scene.sensors() or ([] if alone is None else [alone])
-    if splats.given_error is None or not sensors:
+    rendered, report = splats.cache.sensor, splats.budget_report
+    sensors = scene.sensors() or ([] if rendered is None else [rendered])
+    if not sensors or (report is not None and report.stale):
         return
+    now, near = parameters_of(scene), splats.near
     if report is None:
-        report = meet_error_budget(splats, scene, sensors, splats.given_error)
-        splats.budget_evidence = Evidence.collect(scene, sensors, splats.near)
-        level, message = mi.LogLevel.Info, report.line()
-    elif report.stale or not (names := splats.budget_evidence.changes(scene, alone, splats.near)):
+        report = meet_error_budget(splats, scene, sensors, splats.given_error or 0.0)
+        splats.budget_evidence = now, sensors, [camera_values(one, near) for one in sensors]
+        mi.Log(mi.LogLevel.Info, report.line())  # pyright: ignore[reportCallIssue]  no type
         return
-    else:
+    then, measured, cameras = splats.budget_evidence
+    names = [k for k in now | then if not _is_same(now.get(k), then.get(k))]
+    is_known = rendered is None or any(rendered is one for one in measured)
+    if not is_known and camera_values(rendered, near) not in cameras:
+        names.append("the sensor")
+    if names:
         report = splats.budget_report = replace(report, stale=format_names(names))
-        level = mi.LogLevel.Warn
         message = (
             f"splats: error {report.budget:.2g}: approximations stay as measured before a change "
             f"of {report.stale}; set 'error' again to measure anew"
         )
-    mi.Log(level, message)  # pyright: ignore[reportCallIssue]  no type in the stub
+        mi.Log(mi.LogLevel.Warn, message)  # pyright: ignore[reportCallIssue]  no type
+
+
+def _is_same(one: object, other: object) -> bool:
+    if dr.is_jit_v(one) and dr.is_jit_v(other):
+        return same_variables(one, other)
+    return type(one) is type(other) and bool(np.all(one == other))
+
+
+def parameters_of(scene: mi.Scene) -> dict[str, object]:
+    """Return all parameters of a scene, detached: held, so that equal indices mean equal values."""
+    params = mi.traverse(scene)
+    return dr.detach({name: parameter_value(params, name) for name in params.properties})
+
+
+def camera_values(sensor: mi.Sensor, near: float) -> list[object]:
+    """Return what the cameras of a sensor depend on, on the host."""
+    states = [read_sensor(one, near).detach() for one in sensors_of(sensor)]
+    return [[s.host, {k: np.array(v).tolist() for k, v in s.device.items()}] for s in states]
+
+
+def digest_of(splats: SplatsState, scene: mi.Scene, sensors: Sequence[mi.Sensor]) -> str:
+    """Return a digest of all that a choice for these sensors depends on, but for the budget."""
+    cameras = [(str(one), camera_values(one, splats.near)) for one in sensors]
+    settings = splats.given_approximations, splats.settings(), mi.variant(), drgs.__version__
+    found = hashlib.sha256(repr((settings, cameras)).encode())
+    parameters = parameters_of(scene) | {"smoothing": splats.smoothing}
+    for name, value in sorted(parameters.items()):
+        array = np.array(value)
+        found.update(repr((name, array.shape, str(array.dtype))).encode())
+        found.update(repr(value).encode() if array.dtype == object else array.tobytes())
+    return found.hexdigest()

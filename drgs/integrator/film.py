@@ -31,27 +31,6 @@ from drgs.splatting.grid import MICRO, Lanes, TileGrid, load_pixels
 Channels = list[Float]  # by pass, each (samples * H * W,): red, green, blue, perhaps alpha, AOVs
 
 
-@dataclass(frozen=True)
-class FilmWindow:
-    """A window of a film, without its pixels."""
-
-    whole: tuple[int, int]  # width and height, px
-    offset: tuple[int, int]
-    extent: tuple[int, int]  # width and height, px
-
-    def size(self) -> mi.ScalarVector2u:
-        """Return the width and height of the whole film."""
-        return mi.ScalarVector2u(self.whole)
-
-    def crop_offset(self) -> mi.ScalarPoint2u:
-        """Return the upper left corner of the window."""
-        return mi.ScalarPoint2u(self.offset)
-
-    def crop_size(self) -> mi.ScalarVector2u:
-        """Return the width and height of the window."""
-        return mi.ScalarVector2u(self.extent)
-
-
 def num_colors(film: mi.Film) -> int:
     """Return the number of a film's colour channels, alpha included."""
     return 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
@@ -63,7 +42,7 @@ def with_weight(film: mi.Film, channels: Channels, weight: Float) -> Channels:
     return [*channels[:count], weight, *channels[count:]]
 
 
-def pixel_corners(film: mi.Film | FilmWindow, samples: int = 1) -> mi.Point2f:
+def pixel_corners(film: mi.Film, samples: int = 1) -> mi.Point2f:
     """Return the upper left corners of pixels, row by row, px; again for each sample."""
     width, height = film.crop_size()
     _, pixel = divide(dr.arange(mi.UInt32, samples * width * height), width * height, samples)
@@ -71,7 +50,7 @@ def pixel_corners(film: mi.Film | FilmWindow, samples: int = 1) -> mi.Point2f:
     return mi.Point2f(pixel - row * width, row)
 
 
-def num_samples(film: mi.Film | FilmWindow, x: Float | float) -> int:
+def num_samples(film: mi.Film, x: Float | float) -> int:
     """Return the samples per pixel of a plane; x may be one number for all pixels."""
     return max(dr.width(x) // dr.prod(film.crop_size()), 1)
 
@@ -318,9 +297,7 @@ def environment_radiance(emitter: mi.Emitter, camera: Camera, place: mi.Point2f)
     return mi.Color3f([dr.block_sum(color, count) for color in radiance]) / count
 
 
-def stretched_radiance(
-    texture: mi.Texture, film: mi.Film | FilmWindow, place: mi.Point2f
-) -> mi.Color3f:
+def stretched_radiance(texture: mi.Texture, film: mi.Film, place: mi.Point2f) -> mi.Color3f:
     """Return a texture that is stretched over the film; place: on the crop window, px."""
     interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(place))
     interaction.uv = (place + mi.Vector2f(film.crop_offset())) / mi.Vector2f(film.size())
@@ -328,7 +305,7 @@ def stretched_radiance(
 
 
 def background_radiance(
-    film: mi.Film | FilmWindow,
+    film: mi.Film,
     background: mi.Emitter | mi.Texture,
     cameras: Sequence[Camera],
     offsets: Sequence[tuple[mi.Float | float, mi.Float | float]],

@@ -121,7 +121,7 @@ class Model:
     background: Background
     config: FitConfig | None  # names the dataset
     ignored: str = ""  # effects not simulated: see the plugin
-    folder: Path | None = None  # of the file, with optional refined cameras
+    path: Path | None = None  # of the file, beside which there may be refined cameras
     from_header: Collection[str] = ()  # names of settings from the file's header
     render: Render = render_views
     error: float | None = None  # budget of the approximations' error; None: as ``settings``
@@ -154,16 +154,33 @@ class Model:
 
     def meet_error_budget(self, scene: mi.Scene, views: Sequence[Viewpoint]) -> BudgetReport:
         """Set approximations within the error; print and return what was found."""
-        from drgs.integrator.error_budget import meet_error_budget
+        from drgs.integrator.error_budget import digest_of, meet_error_budget
+        from drgs.results.budget_memory import memory_path, recall, remember
 
-        integrator = scene.integrator()
+        integrator, sensors = scene.integrator(), make_sensors(views)
         assert self.error is not None and is_splats(integrator), "scene() sets it"
-        try:
-            report = meet_error_budget(integrator.state, scene, make_sensors(views), self.error)
-        except PluginError as error:
-            raise UserError(f"--{str(error).removeprefix('splats: ')}") from None
+        splats, path = integrator.state, self.path and memory_path(self.path)
+        digest = f"{self.error} {digest_of(splats, scene, sensors)}"
+        report = splats.budget_report = recall(path, digest, splats.given_approximations)
+        if report is None:
+            try:
+                report = meet_error_budget(splats, scene, sensors, self.error)
+            except PluginError as error:
+                raise UserError(f"--{str(error).removeprefix('splats: ')}") from None
+            remember(path, digest, report)
         print(report.line(), flush=True)
         return report
+
+    def most_accurate_images(
+        self, report: BudgetReport, views: Sequence[Viewpoint]
+    ) -> Iterator[np.ndarray]:
+        """Yield the images (H, W, 3) of views relative to which errors are, in this process."""
+        changes = {**report.most_accurate}
+        if (samples := changes.pop("shutter_samples", None)) is not None:
+            motions = [one.motion and replace(one.motion, samples=samples) for one in views]
+            views = [replace(one, motion=m) for one, m in zip(views, motions, strict=True)]
+        settings = self.settings.model_copy(update=changes)
+        return render_views(replace(self, settings=settings).scene(), views)
 
     def within_error(self, error: float, views: Sequence[Viewpoint]) -> Model:
         """Return this with approximations within an error at the views; print what was found."""
@@ -178,7 +195,7 @@ class Model:
             )
         dataset = load_dataset(self.config.data_for_rendering, sections=self.config.sections)
         dataset = dataset.relative_to(self.gaussians.origin)
-        if self.folder is None or not (path := self.folder / CAMERAS).is_file():
+        if self.path is None or not (path := self.path.parent / CAMERAS).is_file():
             return dataset
         if not self.config.section("cameras", CamerasConfig).optimise:
             print(
@@ -187,7 +204,7 @@ class Model:
             )
             return dataset
         print(f"cameras: as refined, from {path}")
-        return refined_dataset(dataset, self.folder)
+        return refined_dataset(dataset, self.path.parent)
 
 
 def load_model(
@@ -228,7 +245,7 @@ def load_model(
         default_background if background is None else background,
         config,
         ", ".join(ignored),
-        path.parent,
+        path,
         tuple(values),
         render,
     )

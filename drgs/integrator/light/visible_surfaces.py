@@ -17,7 +17,7 @@ import mitsuba as mi
 from drgs.cameras.camera import Camera
 from drgs.core.types import Float
 from drgs.effects.occlusion import Surface
-from drgs.integrator.film import FilmWindow, num_samples, pixel_corners
+from drgs.integrator.film import num_samples, pixel_corners
 from drgs.integrator.light.rays import MAX_INVISIBLE_OPACITY, StraightRays
 
 EDGE_GRID = 4  # rays along each axis of a pixel in which a surface ends
@@ -67,7 +67,7 @@ def transmittance_behind(surfaces: Sequence[Surface]) -> mi.Float:
 def trace_surfaces(
     rays: StraightRays,
     far: float,
-    film: mi.Film | FilmWindow,
+    film: mi.Film,
     cameras: Sequence[Camera],
     within: Sequence[tuple[Float | float, Float | float]],
     with_normals: bool,
@@ -156,7 +156,7 @@ class _Tracer:
         return VisibleSurface(dr.select(valid, depth, MISSING_SURFACE_DEPTH), coverage, normal)
 
     def trace_with_edges(
-        self, camera: Camera, film: mi.Film | FilmWindow, x: Float | float, y: Float | float
+        self, camera: Camera, film: mi.Film, x: Float | float, y: Float | float
     ) -> SurfaceLayers:
         """Trace at one place of each pixel, or at several where coverage differs in its neighbours.
 
