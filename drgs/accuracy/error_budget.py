@@ -155,9 +155,11 @@ class BudgetReport:
     def line(self) -> str:
         """Return one line for the user."""
         low, high = min(self.errors), max(self.errors)
+        errors = f"{low:.2g} to {high:.2g} at {len(self.errors)} views"
         line = (
-            f"error at most {self.budget:.2g}: {self.chosen.words}: {low:.2g} to {high:.2g} at "
-            f"{len(self.errors)} views, about {self.chosen.cost:.2g} times the time of the default"
+            f"error at most {self.budget:.2g}: {self.chosen.words}: "
+            f"{errors if len(self.errors) > 1 else f'{high:.2g} at 1 view'}, about "
+            f"{self.chosen.cost:.2g} times the time of the default"
         )
         for other in (self.faster, self.better):
             if other is not None:

@@ -206,7 +206,8 @@ def run_with_arguments(args: argparse.Namespace, render: Render) -> None:
             overrides, background = [*(args.set or ()), *data], parse_background(args.background)
             effects = args.ignore or ()
             model = load_model(args.what, args.scene, overrides, background, effects, render)
-            render_model(args, replace(model, error=args.error), folder)
+            model = replace(model, error=args.error, error_images=bool(args.error_image))
+            render_model(args, model, folder)
         print(f"written: {args.out}")
 
 

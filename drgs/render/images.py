@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from matplotlib import colormaps
 
 from drgs.cameras.orbits import orbit_of_gaussians, orbit_of_views, orbit_size
 from drgs.cameras.viewpoints import (
@@ -33,8 +32,6 @@ from drgs.results.refined_cameras import training_cameras
 DEFAULT_SIZE, PANORAMA_SIZE = (400, 400), (800, 400)
 """Width and height, px, where nothing else decides how large an image is."""
 
-BRIGHTEST_ERROR = 4  # budgets: error of a pixel that has the brightest colour
-
 
 def render_model(args: argparse.Namespace, model: Model, folder: ImageFolder) -> None:
     """Render Gaussians from the cameras that the command line names."""
@@ -43,23 +40,20 @@ def render_model(args: argparse.Namespace, model: Model, folder: ImageFolder) ->
     if args.orbit is not None:
         render_orbit(model, args, folder)
     elif args.camera is not None or args.origin is not None:
-        for _ in render_cameras(model, viewpoints_of(args, model), args, folder):
+        for _ in render_cameras(model, viewpoints_of(args, model), folder):
             pass
     else:
-        render_split(model, args, folder)
+        render_split(model, args.split or "test", folder)
     folder.write_budget()
 
 
-def render_split(model: Model, args: argparse.Namespace, folder: ImageFolder) -> None:
+def render_split(model: Model, split: str, folder: ImageFolder) -> None:
     """Render the views of a dataset's split, measure them, and print and write the result."""
-    split = args.split or "test"
     dataset = model.dataset(f"--split {split}")
     print(dataset.description)
     views = dataset.train if split == "train" else dataset.test
     column = max(len("view"), *(len(view.name) for view in views))
-    others = [METRICS, *_names_of_errors(args, views)]
-    images = model.images(views, folder, others, "give --set data.image_size=...")
-    images = with_errors(args, model, views, images, folder)
+    images = model.images(views, folder, [METRICS], "give --set data.image_size=...")
     print(f"{'view':{column}}  PSNR [dB]    SSIM")
     scores: dict[str, dict[str, float]] = {}
     for view, image in zip(views, images, strict=True):
@@ -94,7 +88,7 @@ def render_orbit(model: Model, args: argparse.Namespace, folder: ImageFolder) ->
     viewpoints = orbit.viewpoints(args.orbit, width, height, fov)
     if args.panorama:
         viewpoints = [panorama(view, orbit.up) for view in viewpoints]
-    images = render_cameras(model, viewpoints, args, folder, [ORBIT])
+    images = render_cameras(model, viewpoints, folder, [ORBIT])
     write_animation(folder.path / ORBIT, images)
 
 
@@ -112,55 +106,13 @@ def _orbited_views(
 
 
 def render_cameras(
-    model: Model,
-    viewpoints: Sequence[Viewpoint],
-    args: argparse.Namespace,
-    folder: ImageFolder,
-    others: Sequence[str] = (),
+    model: Model, viewpoints: Sequence[Viewpoint], folder: ImageFolder, others: Sequence[str] = ()
 ) -> Iterator[np.ndarray]:
     """Write and yield images without photographs; others: further files to be written."""
-    others = [*others, *_names_of_errors(args, viewpoints)]
     images = model.images(viewpoints, folder, others, "give a smaller --size")
-    images = with_errors(args, model, viewpoints, images, folder)
     for camera, image in zip(viewpoints, images, strict=True):
         folder.write_png(f"{camera.name}.png", image)
         print(f"{camera.name}: {camera.width}x{camera.height}", flush=True)
-        yield image
-
-
-def _names_of_errors(args: argparse.Namespace, views: Sequence[Viewpoint]) -> list[str]:
-    return [f"{view.name}.error.png" for view in views] if args.error_image else []
-
-
-def with_errors(
-    args: argparse.Namespace,
-    model: Model,
-    views: Sequence[Viewpoint],
-    images: Iterator[np.ndarray],
-    folder: ImageFolder,
-) -> Iterator[np.ndarray]:
-    """Yield the images; with ``--error-image``, write beside each where its error is, as colours.
-
-    The root mean square over channels of the difference from the most accurate image; black is 0,
-    and the brightest colour is :data:`BRIGHTEST_ERROR` times the budget, or more.
-    """
-    if not args.error_image:
-        yield from images
-        return
-    exact: Iterator[np.ndarray] | None = None
-    for view, image in zip(views, images, strict=True):
-        assert folder.budget is not None, "found before the first image"
-        exact = exact or model.most_accurate_images(folder.budget, views)
-        square = np.square(image - next(exact), dtype=np.float64).mean(axis=-1)
-        brightest = BRIGHTEST_ERROR * folder.budget.budget
-        colors = colormaps["inferno"](np.sqrt(square) / brightest)[..., :3]
-        folder.write_png(f"{view.name}.error.png", colors)
-        print(
-            f"{view.name}.error.png: {math.sqrt(square.mean()):.2g}, at most "
-            f"{math.sqrt(square.max()):.2g} (brightest from {brightest:.2g}), for "
-            f"{folder.budget.chosen.cost:.2g} times the time of the default",
-            flush=True,
-        )
         yield image
 
 

@@ -8,6 +8,7 @@ where it cannot be written, or a file of another kind has its name, nothing is w
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -20,6 +21,7 @@ from drgs.config.approximations import Approximations
 from drgs.core.errors import UserError
 from drgs.core.files import read_text, write_json
 
+CHOICES = ("chosen", "better", "faster")
 KIND = "choices of drgs for error budgets"
 MAX_CHOICES = 64  # of a file: the last ones
 MAX_BYTES = 1 << 20
@@ -36,14 +38,12 @@ def recall(path: Path | None, digest: str, given: Approximations) -> BudgetRepor
     """Return the choice for a digest; given: approximations that it changes. None: unknown."""
     try:
         found = dict(_read(path)[digest])
-        for name in ("chosen", "better", "faster"):
-            if found[name] is not None:
-                values = found[name]
+        for name in CHOICES:
+            if (values := found[name]) is not None:
                 changes = {k: v for k, v in values["changes"].items() if k != SAMPLES}
-                values["approximations"] = replace(given, **changes)
-                found[name] = Choice(**values)
-        report = BudgetReport(**found | {"errors": tuple(map(float, found["errors"]))})
-        report.line()
+                found[name] = Choice(replace(given, **changes), **values)
+        report = BudgetReport(**found | {"errors": tuple(found["errors"])})
+        report.line()  # which fails for values of a wrong type
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
     return report
@@ -51,26 +51,21 @@ def recall(path: Path | None, digest: str, given: Approximations) -> BudgetRepor
 
 def remember(path: Path | None, digest: str, report: BudgetReport) -> None:
     """Write a choice for a digest, where that is possible."""
-    if path is None:
-        return
-    if not (choices := _read(path)) and (path.exists() or path.is_symlink()):
+    if path is None or (not (choices := _read(path)) and os.path.lexists(path)):
         return
     record = asdict(report)
-    for choice in (record["chosen"], record["better"], record["faster"]):
-        if choice is not None:
-            del choice["approximations"]
-    choices = {**choices, digest: record}
-    choices = {key: choices[key] for key in [*choices][-MAX_CHOICES:]}
+    for name in CHOICES:
+        if record[name] is not None:
+            del record[name]["approximations"]
+    choices = dict([*choices.items(), (digest, record)][-MAX_CHOICES:])
     with suppress(UserError):
         write_json(path, {"kind": KIND, "choices": choices})
 
 
 def _read(path: Path | None) -> Mapping[str, Any]:
     """Return all choices of a file; empty for none and for a file of another kind."""
-    with suppress(UserError, ValueError, RecursionError):
+    with suppress(UserError, ValueError, TypeError, KeyError, RecursionError):
         if path is not None and path.is_file() and not path.is_symlink():
             content = json.loads(read_text(path, "choices for error budgets", MAX_BYTES))
-            if isinstance(content, dict) and content.get("kind") == KIND:
-                choices = content.get("choices")
-                return choices if isinstance(choices, dict) else {}
+            return dict(content["choices"]) if content["kind"] == KIND else {}
     return {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import mitsuba as mi
 import numpy as np
+from matplotlib import colormaps
 
 from drgs.cameras.orbits import near_plane_of
 from drgs.cameras.viewpoints import Viewpoint
@@ -49,6 +51,8 @@ Render = Callable[..., Iterator[np.ndarray]]
 
 COMMAND = "render"
 BUDGET_KEY = "drgs error budget"  # of images' metadata
+ERROR_SUFFIX = ".error.png"  # of the picture of an image's error
+BRIGHTEST_ERROR = 4  # budgets: error of a pixel that has the brightest colour
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr")
 
 Image = TypeVar("Image")
@@ -125,6 +129,7 @@ class Model:
     from_header: Collection[str] = ()  # names of settings from the file's header
     render: Render = render_views
     error: float | None = None  # budget of the approximations' error; None: as ``settings``
+    error_images: bool = False  # whether pictures of the error are written as well
 
     def scene(self) -> mi.Scene:
         """Return a Mitsuba scene that renders in display space."""
@@ -150,7 +155,10 @@ class Model:
         if self.error is not None:
             folder.budget = self.meet_error_budget(scene, views)
             names.append(ERROR_BUDGET)
-        return folder.claim(names, self.render(scene, views))
+        if self.error_images:
+            names += [f"{view.name}{ERROR_SUFFIX}" for view in views]
+        images = folder.claim(names, self.render(scene, views))
+        return self._with_errors(views, folder, images) if self.error_images else images
 
     def meet_error_budget(self, scene: mi.Scene, views: Sequence[Viewpoint]) -> BudgetReport:
         """Set approximations within the error; print and return what was found."""
@@ -171,16 +179,35 @@ class Model:
         print(report.line(), flush=True)
         return report
 
-    def most_accurate_images(
-        self, report: BudgetReport, views: Sequence[Viewpoint]
+    def _with_errors(
+        self, views: Sequence[Viewpoint], folder: ImageFolder, images: Iterator[np.ndarray]
     ) -> Iterator[np.ndarray]:
-        """Yield the images (H, W, 3) of views relative to which errors are, in this process."""
-        changes = {**report.most_accurate}
-        if (samples := changes.pop("shutter_samples", None)) is not None:
-            motions = [one.motion and replace(one.motion, samples=samples) for one in views]
-            views = [replace(one, motion=m) for one, m in zip(views, motions, strict=True)]
+        """Yield the images; write the root mean square over channels of each pixel's error.
+
+        Colours go from black, for 0, to the brightest for :data:`BRIGHTEST_ERROR` budgets or more.
+        """
+        assert folder.budget is not None, "errors are relative to its most accurate image"
+        report, changes = folder.budget, {**folder.budget.most_accurate}
+        exact_views = [
+            replace(one, motion=replace(one.motion, samples=changes["shutter_samples"]))
+            if one.motion is not None and "shutter_samples" in changes
+            else one
+            for one in views
+        ]
         settings = self.settings.model_copy(update=changes)
-        return render_views(replace(self, settings=settings).scene(), views)
+        exact = render_views(replace(self, settings=settings).scene(), exact_views)
+        brightest = BRIGHTEST_ERROR * report.budget
+        for view, image in zip(views, images, strict=True):
+            square = np.square(image - next(exact), dtype=np.float64).mean(axis=-1)
+            colors = colormaps["inferno"](np.sqrt(square) / brightest)[..., :3]
+            folder.write_png(f"{view.name}{ERROR_SUFFIX}", colors)
+            print(
+                f"{view.name}{ERROR_SUFFIX}: {math.sqrt(square.mean()):.2g}, at most "
+                f"{math.sqrt(square.max()):.2g} (brightest from {brightest:.2g}), for "
+                f"{report.chosen.cost:.2g} times the time of the default",
+                flush=True,
+            )
+            yield image
 
     def within_error(self, error: float, views: Sequence[Viewpoint]) -> Model:
         """Return this with approximations within an error at the views; print what was found."""

@@ -342,7 +342,7 @@ def test_error_images_show_where_errors_are(copied, tmp_path, capsys):
     image = np.asarray(Image.open(tmp_path / "out" / "camera.png"), np.float64) / 255
     error = np.sqrt(np.mean((image - np.clip(exact, 0, 1)) ** 2, axis=-1))
     expected = colormaps["inferno"](error / 0.2)[..., :3]
-    # The image has 8 bits, half a level of which is 2.5 of 256 colours, each a step of 0.02 at most.
+    # Half a level of 8 bits is 2.5 of the 256 colours, each a step of 0.02 at most.
     assert np.abs(shown - expected).max() < 0.06
     assert error.max() > 0.02, "a scene with errors"
     total = np.sqrt(np.mean(error**2))
