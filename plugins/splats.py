@@ -140,8 +140,8 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - Largest root mean square error of an image in display space, from 0.00002 to below 1, also
          as "54 dB" or "0.5 steps" (of 8 bits). The cheapest approximations within it are found at
          the first rendering, by images of a few of the scene's sensors, and so are the samples of
-         an open shutter. Filters, falloff, ``alpha_max`` and ``extent`` stay. AOVs are not measured.
-         ``budget_report.stale`` names parameters that changed afterwards. (Default: none)
+         an open shutter. Filters, falloff, ``alpha_max`` and ``extent`` stay. AOVs are not
+         measured. ``budget_report.stale`` names parameters that changed afterwards. (Default: none)
      * - projection, falloff, order, order_window, sh_direction, alpha_max, alpha_cut,
          transmittance_stop, extent, low_pass, antialiased
        - |string|, |int|, |float| or |bool|

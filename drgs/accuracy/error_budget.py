@@ -146,9 +146,7 @@ class BudgetReport:
     errors: tuple[float, ...]  # of the measured views
     better: Choice | None  # next choice with a clearly smaller error; None: there is none
     faster: Choice | None  # next choice that is clearly faster
-    most_accurate: Changes = field(
-        default_factory=dict
-    )  # of the images that errors are relative to
+    most_accurate: Changes = field(default_factory=dict)  # of the images that errors refer to
     uncertainty: float = 0.0  # error of these images themselves, part of all errors
     stale: str = ""  # names of what has changed since; "": nothing
 
@@ -193,7 +191,7 @@ class MeasuredView:
     """A view that is measured, and the window in which orders are."""
 
     camera: Camera
-    window: Window | None = None  # None: the whole view
+    window: Window
     share: float = 1.0  # probability with which the window was drawn
 
     @staticmethod
@@ -218,8 +216,6 @@ class MeasuredView:
 
     def cut(self, image: np.ndarray) -> np.ndarray:
         """Return the window of an image of the view."""
-        if self.window is None:
-            return image
         x, y, width, height = self.window
         return image[y : y + height, x : x + width]
 
@@ -328,7 +324,7 @@ class Search:
         projected = projections(measured)
         first = projected[0], CENTER, DIRECTIONS[0], CUT_OFFS[1]
         self._start = {k: v for level in first for k, v in level.changes.items()}
-        self._views = [MeasuredView(camera) for camera in measured]
+        self._views = [MeasuredView(one, (0, 0, one.width, one.height)) for one in measured]
         if not is_complete:
             pairs = zip(self._of_views({}), self._of_views(WINDOWED[0].changes), strict=True)
             self._views = [
@@ -370,8 +366,8 @@ class Search:
         key = is_whole, frozenset(values.items())
         if key not in self._images:
             self._images[key] = [
-                self._renderer.image(view.camera, values, window=None if is_whole else view.window)
-                for view in self._views
+                self._renderer.image(one.camera, values, window=None if is_whole else one.window)
+                for one in self._views
             ]
         return self._images[key]
 
@@ -455,15 +451,13 @@ class Search:
         while True:
             squares = [found.get(k, correction * c.of_views) for k, c in enumerate(self.front)]
             errors = [self.bound(np.sqrt(each)) for each in squares]
-            limits = [budget if k in found else slack * budget for k in range(last + 1)]
-            within = (k for k in range(last + 1) if errors[k] <= limits[k])
-            place = next(within, last)
+            limits = (budget if k in found else slack * budget for k in range(last + 1))
+            pairs = enumerate(zip(errors, limits, strict=True))
+            place = next((k for k, (error, limit) in pairs if error <= limit), last)
             if place not in found:
-                measured, predicted = self.measure(place), self.front[place].in_windows
-                correction = float(measured.sum() / max(predicted.sum(), 1e-30))
-                is_whole = self.bound is _largest
-                of_views = self.front[place].of_views
-                found[place] = measured if is_whole else correction * of_views
+                measured, predicted = self.measure(place), self.front[place]
+                correction = float(measured.sum() / max(predicted.in_windows.sum(), 1e-30))
+                found[place] = measured if slack > 1 else correction * predicted.of_views
             elif errors[place] <= budget:
                 return place, np.sqrt(found[place]).tolist(), errors
             else:

@@ -46,6 +46,7 @@ from drgs.splatting.projection import load_rows
 
 PATHS = 16  # per pixel, of the radiance of surfaces
 RESIDUAL_PX = 48  # side of the part of a window in which rays are traced
+FILM_NUMBERS = ("width", "height", "crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
 LARGE = 0.25  # standard deviation of a splat relative to its depth, whose order is hard to find
 
 
@@ -74,20 +75,11 @@ def renderer_of(
     return Renderer(draw, given, partial(ray_residual, gaussians, sh_degree))
 
 
-def cropped_film(film: mi.Film, corner: Sequence[int], width: int, height: int) -> mi.Film:
-    """Return a film of the same size with another crop window, px."""
-    size = dict(zip(("width", "height"), map(int, film.size()), strict=True))
-    crop = dict(zip(("crop_offset_x", "crop_offset_y"), map(int, corner), strict=True))
-    return mi.load_dict(
-        {"type": "hdrfilm", **size, **crop, "crop_width": width, "crop_height": height}
-    )
-
-
 def ray_residual(
     gaussians: Gaussians,
     sh_degree: int,
     camera: Camera,
-    window: Window | None,
+    window: Window,
     approximations: Approximations,
 ) -> float:
     """Return the mean square difference between an image and exact colours along its rays.
@@ -96,38 +88,27 @@ def ray_residual(
     without a low-pass filter, which rays do not have, and the background is black or white. 0 where
     no visible Gaussian is :data:`LARGE`, and for cameras that blur.
     """
-    if camera.aperture is not None or camera.shutter is not None:
-        return 0.0
     rows, t = load_rows(gaussians, sh_degree), types_of(type(camera.near))
     depth = (camera.rotation @ (rows.means - camera.center)).z
     visible = depth > camera.near
-    if not dr.any(visible & (dr.exp(dr.max(rows.log_scales)) > LARGE * depth)):
+    is_blurred = camera.aperture is not None or camera.shutter is not None
+    if is_blurred or not dr.any(visible & (dr.exp(dr.max(rows.log_scales)) > LARGE * depth)):
         return 0.0
-    x, y, width, height = window or (0, 0, camera.width, camera.height)
-    left, top = (max(size - RESIDUAL_PX, 0) // 2 for size in (width, height))
-    size = min(width, RESIDUAL_PX), min(height, RESIDUAL_PX)
-    camera = crop(camera, x + left, y + top, *size)
+    x, y, *sides = window
+    left, top = (max(side - RESIDUAL_PX, 0) // 2 for side in sides)
+    width, height = (min(side, RESIDUAL_PX) for side in sides)
+    camera = crop(camera, x + left, y + top, width, height)
     pipeline = pipeline_of(replace(approximations, low_pass=0.0), sh_degree)
     pipeline = with_effects(pipeline, gaussians, camera)
-    rows = pipeline.rows(rows)
     rows = replace(rows, logit_opacities=dr.select(visible, rows.logit_opacities, -dr.inf))
-    pixel = dr.arange(t.UInt32, size[0] * size[1])
-    row = pixel // size[0]
-    origin, towards, seen = camera.look_through(
-        t.Float(pixel - row * size[0]) + 0.5, t.Float(row) + 0.5
-    )
-    to_world, splats = (
-        camera.rotation.T,
-        RaySplats.from_gaussians(rows, sh_degree, pipeline.model.cutoffs),
-    )
-    color, rest = splats.composite_segment(
-        Segment(
-            camera.center + to_world @ origin,
-            dr.normalize(to_world @ towards),
-            dr.full(t.Float, dr.inf, dr.width(pixel)),
-            dr.full(t.Bool, True, dr.width(pixel)) & seen,
-        )
-    )
+    splats = RaySplats.from_gaussians(pipeline.rows(rows), sh_degree, pipeline.model.cutoffs)
+    pixel = dr.arange(t.UInt32, width * height)
+    row = pixel // width
+    place = t.Float(pixel - row * width) + 0.5, t.Float(row) + 0.5
+    origin, towards, seen = camera.look_through(*place)
+    origin = camera.center + camera.rotation.T @ origin + dr.zeros(t.Array3f, width * height)
+    towards, far = dr.normalize(camera.rotation.T @ towards), dr.full(t.Float, dr.inf, len(pixel))
+    color, rest = splats.composite_segment(Segment(origin, towards, far, (far > 0) & seen))
     planes = rendering.render(gaussians, camera, pipeline).planes()
     exact = np.array([np.array(plane) for plane in (rest, *color)], np.float64)
     rest, *color = np.array([np.array(plane) for plane in planes]) - exact
@@ -150,8 +131,11 @@ class _SceneRenderer:
         splats, cache = self.splats, self.splats.cache
         choice = Choice(approximations, {SAMPLES: samples}, 0.0, 0.0)
         splats.budget_report = BudgetReport(0.0, choice, (), None, None)
-        x, y, width, height = window or (0, 0, camera.width, camera.height)
+        x, y, *size = window or (0, 0, camera.width, camera.height)
         film, place = sensor.film(), f"{id(camera)} {window}"
+        left, top = film.crop_offset()
+        numbers = map(int, (*film.size(), left + x, top + y, *size))
+        part = {"type": "hdrfilm", **dict(zip(FILM_NUMBERS, numbers, strict=True))}
         view = SensorRender(
             splats=splats,
             scene=self.scene,
@@ -161,7 +145,7 @@ class _SceneRenderer:
             key=None,
             has_alpha=False,
             nested=nested_surfaces(splats, self.scene, sensor, 0, 0),
-            window=cropped_film(film, film.crop_offset() + mi.ScalarVector2u(x, y), width, height),
+            window=mi.load_dict(part),
         )
         if view.nested is not None:
             count = view.num_surfaces(view.nested)
@@ -176,7 +160,7 @@ class _SceneRenderer:
             color += mi.Color3f(compositor.visible_radiance(own, images))
         if splats.srgb_primitives:
             color = mi.math.linear_to_srgb(color)
-        return np.array(color).T.reshape(height, width, 3)
+        return np.array(color).T.reshape(*size[::-1], 3)
 
     def _nested_images(self, view: SensorRender, place: str) -> list[list[mi.Float]]:
         """Return the nested images N_0, N_1, ... of a view, linear."""

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 import mitsuba as mi
 import numpy as np
-from matplotlib import colormaps
 
 from drgs.cameras.orbits import near_plane_of
 from drgs.cameras.viewpoints import Viewpoint
@@ -182,20 +181,16 @@ class Model:
     def _with_errors(
         self, views: Sequence[Viewpoint], folder: ImageFolder, images: Iterator[np.ndarray]
     ) -> Iterator[np.ndarray]:
-        """Yield the images; write the root mean square over channels of each pixel's error.
+        """Yield the images; write each pixel's root mean square error over channels, as colours."""
+        from matplotlib import colormaps
 
-        Colours go from black, for 0, to the brightest for :data:`BRIGHTEST_ERROR` budgets or more.
-        """
         assert folder.budget is not None, "errors are relative to its most accurate image"
         report, changes = folder.budget, {**folder.budget.most_accurate}
-        exact_views = [
-            replace(one, motion=replace(one.motion, samples=changes["shutter_samples"]))
-            if one.motion is not None and "shutter_samples" in changes
-            else one
-            for one in views
-        ]
+        if (samples := changes.pop("shutter_samples", 0)) > 0:
+            motions = [one.motion and replace(one.motion, samples=samples) for one in views]
+            views = [replace(one, motion=m) for one, m in zip(views, motions, strict=True)]
         settings = self.settings.model_copy(update=changes)
-        exact = render_views(replace(self, settings=settings).scene(), exact_views)
+        exact = render_views(replace(self, settings=settings).scene(), views)
         brightest = BRIGHTEST_ERROR * report.budget
         for view, image in zip(views, images, strict=True):
             square = np.square(image - next(exact), dtype=np.float64).mean(axis=-1)

@@ -38,6 +38,7 @@ def gaussians_of(count, scale, logit, color, seed=0):
 HAZE = gaussians_of(400, 0.3, -4.25, -1.7)
 """Dark splats, hardly any of which is above the usual cut of alpha; together, they hide much."""
 
+WHOLE = (0, 0, WIDTH, HEIGHT)
 FOCAL = WIDTH / 2 / np.tan(np.radians(FOV / 2))
 ALONG_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # world to camera
 CAMERA = reference.Camera(
@@ -225,10 +226,10 @@ def test_rays_measure_the_error_of_the_most_accurate_image_among_giants(count, w
     for value, exact in zip((0.0, 1.0), truth, strict=True):
         renderer = error_budget.renderer_of(on_device, values, 0, 3 * (value,))
         errors.append(np.mean((renderer.image(camera) - exact) ** 2))
-    residual = partial(error_budget.ray_residual, on_device, 0, camera, None)
+    residual = partial(error_budget.ray_residual, on_device, 0, camera, WHOLE)
     assert max(errors) > 1e-4**2
     assert residual(values) == pytest.approx(max(errors), rel=0.02)
-    assert error_budget.ray_residual(HAZE.to(llvm.TensorXf), 0, camera, None, values) == 0
+    assert error_budget.ray_residual(HAZE.to(llvm.TensorXf), 0, camera, WHOLE, values) == 0
 
 
 def test_an_inaccurate_most_accurate_image_is_reported():
