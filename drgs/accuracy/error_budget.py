@@ -37,10 +37,9 @@ from drgs.core.arrays import types_of
 from drgs.core.constants import ALPHA_CUT, MAX_SHUTTER_SAMPLES, TRANSMITTANCE_STOP
 
 MIN_VIEWS, MAX_VIEWS = 3, 6  # that are measured, if there are so many
-VIEWS_PER_MEASURED = 20  # above the fewest: measuring takes a part of the time of all images
 MAX_PIXELS = 4_000_000  # of them together, unless they are the fewest
 MAX_WHOLE_PIXELS = 1_000_000  # of all views together, for which nothing is estimated
-WINDOW_PX = 84  # side of a window, at most about
+WINDOW_PX = 100  # side of a window, at most about
 AREA_SHARE = 0.2  # of the probability of a cell, by its area; the rest by its error
 CONFIDENCE = 0.95  # share of the views that shall be within the budget
 TYPICAL_SPREAD = 0.15  # of the logarithm of the errors of a file's views
@@ -285,9 +284,7 @@ def bound(errors: Sequence[float] | np.ndarray) -> float:
 
 def measured_places(num_views: int, pixels: int) -> list[int]:
     """Return the places of the views that are measured, evenly among all; pixels: of a view."""
-    most = max(MIN_VIEWS, min(MAX_VIEWS, MAX_PIXELS // pixels))
-    few = MAX_VIEWS if num_views <= MAX_VIEWS else max(MIN_VIEWS, num_views // VIEWS_PER_MEASURED)
-    count = min(num_views, most, few)
+    count = min(num_views, max(MIN_VIEWS, min(MAX_VIEWS, MAX_PIXELS // pixels)))
     return [int((k + 0.5) * num_views / count) for k in range(count)]
 
 

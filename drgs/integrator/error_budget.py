@@ -116,7 +116,7 @@ def ray_residual(
 
 
 @dataclass(frozen=True, eq=False)
-class _SceneRenderer:
+class SceneRenderer:
     """Renders views of a scene in display space; see :attr:`.Renderer.draw`."""
 
     splats: SplatsState  # a copy with a cache of its own
@@ -203,7 +203,7 @@ def meet_error_budget(
                 without_effects(camera_from_sensor(read_sensor(one, splats.near)), splats.ignore)
                 for one in alone
             ]
-            drawer = _SceneRenderer(copy, scene, list(zip(cameras, alone, strict=True)))
+            drawer = SceneRenderer(copy, scene, list(zip(cameras, alone, strict=True)))
             residual = partial(ray_residual, dr.detach(copy.gaussians), copy.sh_degree)
             renderer = Renderer(drawer.draw, splats.given_approximations, residual)
             report = splats.budget_report = Search(renderer, cameras).choose(budget)

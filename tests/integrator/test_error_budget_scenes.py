@@ -14,6 +14,7 @@ from drgs.bench.scenes import device_camera
 from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator import error_budget
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.reference import rays
 from drgs.reference import splatting as reference
 
@@ -242,3 +243,44 @@ def test_an_inaccurate_most_accurate_image_is_reported():
     assert 0 < report.uncertainty <= min(report.errors)
     line = replace(report, budget=2 * report.uncertainty).line()
     assert f"the most accurate image is itself within {report.uncertainty:.2g} only" in line
+
+
+SENSORS = {
+    "perspective": {},
+    "cropped": {"crop": {"crop_offset_x": 5, "crop_offset_y": 3, "crop_width": 40, "crop_height": 24}},
+    "thinlens": {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 4.0},
+    "fisheye": {"type": "calibrated", "lens": "fisheye", "fx": 40.0, "fy": 40.0},
+    "moving": {"type": "calibrated", "fx": 60.0, "fy": 60.0, "shutter": "global"},
+}
+"""Kinds of sensors; ``moving`` has a second pose."""
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+@pytest.mark.parametrize("behind", ["environment", "texture"])
+def test_measured_images_are_the_integrators_own(kind, behind):
+    """Whole and in windows; tolerance: rounding."""
+    pixels = np.linspace(0, 1, 8 * 16 * 3).reshape(8, 16, 3).astype(np.float32)
+    objects, settings, others = {}, {}, dict(SENSORS[kind])
+    if behind == "environment":
+        objects = {"sky": {"type": "envmap", "bitmap": mi.Bitmap(pixels)}}
+    else:
+        settings["background"] = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+    if kind == "moving":
+        close = mi.ScalarTransform4f().look_at([0.5, -DISTANCE, 0], [0, 0, 0], [0, 0, 1])
+        others |= {"to_world_close": close, "shutter_samples": 3}
+    film = sensor()["film"] | others.pop("crop", {})
+    view = sensor(**others, film=film)
+    if view["type"] == "calibrated":
+        del view["fov"]
+        view |= {"cx": WIDTH / 2, "cy": HEIGHT / 2}
+    scene = load(objects, error=None, **settings)
+    view, state = mi.load_dict(view), scene.integrator().state
+    expected = encode(np.array(mi.render(scene, sensor=view, spp=1), np.float64))
+    camera = camera_from_sensor(read_sensor(view, state.near))
+    copy = replace(state, cache=replace(state.cache, kept={}))
+    renderer = error_budget.SceneRenderer(copy, scene, [(camera, view)])
+    x, y, width, height = window = 7, 5, 20, 12
+    draw = partial(renderer.draw, approximations=Approximations(), samples=3)
+    np.testing.assert_allclose(draw(camera, None), expected, atol=2e-6)
+    part = expected[y : y + height, x : x + width]
+    np.testing.assert_allclose(draw(camera, window), part, atol=2e-6)
