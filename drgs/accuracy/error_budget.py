@@ -315,7 +315,7 @@ class Search:
         places = measured_places(len(cameras), max(pixels))
         measured = [cameras[k] for k in places]
         is_complete = len(places) == len(cameras) and sum(pixels) <= MAX_WHOLE_PIXELS
-        self.bound = _largest if is_complete else bound
+        self.bound: Callable[[np.ndarray], float] = max if is_complete else bound
         """The error of all views, from those of the measured ones."""
         self._images: dict[tuple[bool, frozenset], list[np.ndarray]] = {}
         projected = projections(measured)
@@ -330,7 +330,6 @@ class Search:
             ]
         last = projected[-1], WINDOWED[-1], DIRECTIONS[-1]
         self._best = {k: v for level in last for k, v in level.changes.items()} | FINEST_CUT_OFFS
-        self._unordered = self._squares_of_best()
         self._orders = self._squares_of_orders()
         squares = [
             self._orders,
@@ -342,7 +341,7 @@ class Search:
         self._most_samples = {SAMPLES: 2 * samples[-1].changes[SAMPLES]} if samples else {}
         if samples:
             squares.append(self._squares(samples, self._most_samples))
-        self.front = _front(renderer.given, squares, self.bound)
+        self.front = self._front(squares)
         """Combinations that no other one beats in cost and predicted error, by cost."""
 
     def _of_views(self, changes: Changes) -> list[np.ndarray]:
@@ -353,7 +352,7 @@ class Search:
         """Return the images of the windows, likewise."""
         values = {**self._start, **changes}
         is_known = (True, frozenset(values.items())) in self._images
-        if is_known or values["order"] == CENTER.changes["order"] or self.bound is _largest:
+        if is_known or values["order"] == CENTER.changes["order"] or self.bound is max:
             pairs = zip(self._of_views(changes), self._views, strict=True)
             return [view.cut(image) for image, view in pairs]
         return self._render(values, is_whole=False)
@@ -382,24 +381,37 @@ class Search:
             found.append(LevelSquares(level, np.array(squares), in_windows))
         return found
 
-    def _squares_of_best(self) -> np.ndarray:
-        """Return the square errors (V,) of the most accurate image, which all others contain.
-
-        They are extrapolated from two windows of splats, or those that the renderer has found.
-        """
-        exact = self._in_windows(WINDOWED[-1].changes)
-        before, last = (self._differences(level.changes, exact) for level in WINDOWED[-3:-1])
-        rest = last * np.minimum(last / np.maximum(before, 1e-20), 0.5)
-        values = replace(self._renderer.given, **self._best)
-        found = [self._renderer.residual(one.camera, one.window, values) for one in self._views]
-        return np.maximum(rest, found)
-
     def _squares_of_orders(self) -> list[LevelSquares]:
-        target, found = self._in_windows(WINDOWED[-1].changes), []
-        for level in (CENTER, *WINDOWED):
-            squares = self._differences(level.changes, target) + self._unordered
-            found.append(LevelSquares(level, squares, squares))
-        return found
+        """Return those of orders; all contain the errors of the most accurate image.
+
+        These are extrapolated from two windows of splats, or what the renderer has found.
+        """
+        levels, target = (CENTER, *WINDOWED), self._in_windows(WINDOWED[-1].changes)
+        squares = [self._differences(level.changes, target) for level in levels]
+        *_, before, last, _ = squares
+        rest, values = last / np.maximum(before, 1e-20), replace(self._renderer.given, **self._best)
+        found = [self._renderer.residual(one.camera, one.window, values) for one in self._views]
+        self._unordered = np.maximum(last * np.minimum(rest, 0.5), found)
+        sums = [each + self._unordered for each in squares]
+        return [LevelSquares(level, each, each) for level, each in zip(levels, sums, strict=True)]
+
+    def _front(self, squares: Sequence[Sequence[LevelSquares]]) -> list[Combination]:
+        found = []
+        for levels in product(*squares):
+            changes = {k: v for each in levels for k, v in each.level.changes.items()}
+            is_ordered = changes["order"] != "center"
+            cost = math.prod(each.level.factor(is_ordered) for each in levels)
+            of_views = np.sum([each.of_views for each in levels], axis=0)
+            in_windows = np.sum([each.in_windows for each in levels], axis=0)
+            values = {k: v for k, v in changes.items() if k != SAMPLES}
+            approximations = replace(self._renderer.given, **values)
+            choice = Choice(approximations, changes, self.bound(np.sqrt(of_views)), cost)
+            found.append(Combination(choice, of_views, in_windows))
+        front: list[Combination] = []
+        for one in sorted(found, key=lambda one: (one.choice.cost, one.choice.error)):
+            if not front or one.choice.error < front[-1].choice.error:
+                front.append(one)
+        return front
 
     def choose(self, budget: float) -> BudgetReport:
         """Return the cheapest approximations within ``budget``; ValueError if there are none."""
@@ -427,7 +439,7 @@ class Search:
         changes = {k: v for k, v in candidate.choice.changes.items() if k != SAMPLES}
         *_, other, _ = self._orders
         is_before = all(changes != changes | one.changes for one in WINDOWED[-2:])
-        if self.bound is bound and is_before:
+        if self.bound is not max and is_before:
             best, rest = best | other.level.changes, other.in_windows
         measured = self._differences(changes, self._in_windows(best)) + rest
         if self._most_samples:
@@ -444,7 +456,7 @@ class Search:
         """
         found: dict[int, np.ndarray] = {}  # of this budget: the choice depends on no other one
         correction, last = 1.0, len(self.front) - 1
-        slack = SLACK if self.bound is _largest else 1.0
+        slack = SLACK if self.bound is max else 1.0
         while True:
             squares = [found.get(k, correction * c.of_views) for k, c in enumerate(self.front)]
             errors = [self.bound(np.sqrt(each)) for each in squares]
@@ -464,37 +476,9 @@ class Search:
                 )
 
 
-def _largest(errors: Sequence[float] | np.ndarray) -> float:
-    """Return the error that no view exceeds, where all are measured."""
-    return float(max(errors))
-
-
 def _rounded_up(error: float) -> str:
     digits = 1 - math.floor(math.log10(error))
     return f"{math.ceil(error * 10**digits) / 10**digits:g}"
-
-
-def _front(
-    given: Approximations,
-    squares: Sequence[Sequence[LevelSquares]],
-    bound: Callable[[np.ndarray], float],
-) -> list[Combination]:
-    """Return the combinations that no other one beats in cost and error, by cost."""
-    found = []
-    for levels in product(*squares):
-        changes = {k: v for each in levels for k, v in each.level.changes.items()}
-        is_ordered = changes["order"] != "center"
-        cost = math.prod(each.level.factor(is_ordered) for each in levels)
-        of_views = np.sum([each.of_views for each in levels], axis=0)
-        in_windows = np.sum([each.in_windows for each in levels], axis=0)
-        approximations = replace(given, **{k: v for k, v in changes.items() if k != SAMPLES})
-        choice = Choice(approximations, changes, bound(np.sqrt(of_views)), cost)
-        found.append(Combination(choice, of_views, in_windows))
-    front: list[Combination] = []
-    for one in sorted(found, key=lambda one: (one.choice.cost, one.choice.error)):
-        if not front or one.choice.error < front[-1].choice.error:
-            front.append(one)
-    return front
 
 
 def check_no_extensions(given: Approximations) -> None:
