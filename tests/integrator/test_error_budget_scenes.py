@@ -135,6 +135,20 @@ def test_budgets_hold_over_what_stands_behind(name):
     assert (report.chosen.changes["alpha_cut"] == 1 / 64) == (name == "nothing")
 
 
+def test_splats_of_another_object_behind_count():
+    """A bright one, moved behind the haze: against the integrator's most accurate image."""
+    ball = gaussians_of(1, 0.8, 9.0, 1.7)
+    other = {k: mi.TensorXf(getattr(ball, k)) for k in PARAMETER_NAMES}
+    other |= {"type": "splats", "to_world": mi.ScalarTransform4f().translate([0, 3, 0])}
+    scene = load({}, behind=other)
+    image = np.array(mi.render(scene, spp=1))
+    cuts = {"alpha_cut": 1e-5, "transmittance_stop": 1e-7, "error": None}
+    exact = np.array(mi.render(load({}, behind=other, **EXACT, **cuts, order_window=64), spp=1))
+    error = np.sqrt(np.mean((encode(image) - encode(exact)) ** 2))
+    assert 0.003 < error <= BUDGET
+    assert scene.integrator().budget_report.errors == pytest.approx([error], rel=0.02)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("light", ["rays", "probe"])
 def test_light_between_splats_and_a_mirror_is_measured(light):
@@ -247,7 +261,9 @@ def test_an_inaccurate_most_accurate_image_is_reported():
 
 SENSORS = {
     "perspective": {},
-    "cropped": {"crop": {"crop_offset_x": 5, "crop_offset_y": 3, "crop_width": 40, "crop_height": 24}},
+    "cropped": {
+        "crop": {"crop_offset_x": 5, "crop_offset_y": 3, "crop_width": 40, "crop_height": 24}
+    },
     "thinlens": {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 4.0},
     "fisheye": {"type": "calibrated", "lens": "fisheye", "fx": 40.0, "fy": 40.0},
     "moving": {"type": "calibrated", "fx": 60.0, "fy": 60.0, "shutter": "global"},
