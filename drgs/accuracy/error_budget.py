@@ -317,16 +317,19 @@ class Search:
         is_complete = len(places) == len(cameras) and sum(pixels) <= MAX_WHOLE_PIXELS
         self.bound: Callable[[np.ndarray], float] = max if is_complete else bound
         """The error of all views, from those of the measured ones."""
-        self._images: dict[tuple[bool, frozenset], list[np.ndarray]] = {}
+        self._images: dict[tuple, np.ndarray] = {}
         projected = projections(measured)
         first = projected[0], CENTER, DIRECTIONS[0], CUT_OFFS[1]
         self._start = {k: v for level in first for k, v in level.changes.items()}
         self._views = [MeasuredView(one, (0, 0, one.width, one.height)) for one in measured]
         if not is_complete:
-            pairs = zip(self._of_views({}), self._of_views(WINDOWED[0].changes), strict=True)
             self._views = [
-                MeasuredView.draw(camera, *pair, (k + 0.5) / len(measured))
-                for k, (camera, pair) in enumerate(zip(measured, pairs, strict=True))
+                MeasuredView.draw(
+                    camera,
+                    *(self._image(k, order, True) for order in ({}, WINDOWED[0].changes)),
+                    (k + 0.5) / len(measured),
+                )
+                for k, camera in enumerate(measured)
             ]
         last = projected[-1], WINDOWED[-1], DIRECTIONS[-1]
         self._best = {k: v for level in last for k, v in level.changes.items()} | FINEST_CUT_OFFS
@@ -344,41 +347,40 @@ class Search:
         self.front = self._front(squares)
         """Combinations that no other one beats in cost and predicted error, by cost."""
 
-    def _of_views(self, changes: Changes) -> list[np.ndarray]:
-        """Return the images of the views, with the cheapest approximations but for ``changes``."""
-        return self._render({**self._start, **changes}, is_whole=True)
+    def _image(self, k: int, changes: Changes, is_whole: bool) -> np.ndarray:
+        """Return view k or its window, with the cheapest approximations but for ``changes``."""
+        values, view = {**self._start, **changes}, self._views[k]
+        key, images = (k, frozenset(values.items())), self._images
+        if is_whole or self.bound is max or key in images:
+            if key not in images:
+                images[key] = self._renderer.image(view.camera, values)
+            return images[key] if is_whole else view.cut(images[key])
+        key = (*key, view.window)
+        if key not in images:
+            images[key] = self._renderer.image(view.camera, values, window=view.window)
+        return images[key]
 
-    def _in_windows(self, changes: Changes) -> list[np.ndarray]:
-        """Return the images of the windows, likewise."""
-        values = {**self._start, **changes}
-        is_known = (True, frozenset(values.items())) in self._images
-        if is_known or values["order"] == CENTER.changes["order"] or self.bound is max:
-            pairs = zip(self._of_views(changes), self._views, strict=True)
-            return [view.cut(image) for image, view in pairs]
-        return self._render(values, is_whole=False)
-
-    def _render(self, values: Changes, is_whole: bool) -> list[np.ndarray]:
-        """Render views or windows once."""
-        key = is_whole, frozenset(values.items())
-        if key not in self._images:
-            self._images[key] = [
-                self._renderer.image(one.camera, values, window=None if is_whole else one.window)
-                for one in self._views
+    def _differences(self, changes: Changes, target: Changes, step: int = 1) -> np.ndarray:
+        """Return the mean square differences (V,) of views, from those of their windows."""
+        return np.array(
+            [
+                view.mean_square(self._image(k, changes, False), self._image(k, target, False))
+                for k, view in enumerate(self._views)
+                if k % step == 0
             ]
-        return self._images[key]
-
-    def _differences(self, changes: Changes, target: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the mean square differences (V,) of the views, from those of the windows."""
-        triples = zip(self._views, self._in_windows(changes), target, strict=True)
-        return np.array([view.mean_square(one, other) for view, one, other in triples])
+        )
 
     def _squares(self, levels: Sequence[Level], finest: Changes) -> list[LevelSquares]:
-        exact, found = self._of_views(finest), []
+        """Return those of levels, of every other view for two unless nothing is estimated."""
+        count, found = len(self._views), []
+        step = 1 if self.bound is max else 2
         for level in levels:
-            pairs = zip(self._of_views(level.changes), exact, strict=True)
-            squares = [np.square(one - other, dtype=np.float64).mean() for one, other in pairs]
-            in_windows = self._differences(level.changes, self._in_windows(finest))
-            found.append(LevelSquares(level, np.array(squares), in_windows))
+            squares = [
+                np.square(self._image(k, level.changes, True) - self._image(k, finest, True)).mean()
+                for k in range(0, count, step)
+            ]
+            pair = squares, self._differences(level.changes, finest, step)
+            found.append(LevelSquares(level, *(np.repeat(each, step)[:count] for each in pair)))
         return found
 
     def _squares_of_orders(self) -> list[LevelSquares]:
@@ -386,7 +388,7 @@ class Search:
 
         These are extrapolated from two windows of splats, or what the renderer has found.
         """
-        levels, target = (CENTER, *WINDOWED), self._in_windows(WINDOWED[-1].changes)
+        levels, target = (CENTER, *WINDOWED), WINDOWED[-1].changes
         squares = [self._differences(level.changes, target) for level in levels]
         *_, before, last, _ = squares
         rest, values = last / np.maximum(before, 1e-20), replace(self._renderer.given, **self._best)
@@ -441,10 +443,10 @@ class Search:
         is_before = all(changes != changes | one.changes for one in WINDOWED[-2:])
         if self.bound is not max and is_before:
             best, rest = best | other.level.changes, other.in_windows
-        measured = self._differences(changes, self._in_windows(best)) + rest
+        measured = self._differences(changes, best) + rest
         if self._most_samples:
             samples = {SAMPLES: candidate.choice.changes[SAMPLES]}
-            measured += self._differences(samples, self._in_windows(self._most_samples))
+            measured += self._differences(samples, self._most_samples)
         return measured
 
     def cheapest(self, budget: float) -> tuple[int, list[float], list[float]]:
