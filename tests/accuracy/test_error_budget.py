@@ -155,7 +155,7 @@ def test_wrong_budgets_are_refused(given):
 
 @pytest.mark.slow
 def test_impossible_budgets_say_what_is_possible(found):
-    with pytest.raises(ValueError, match=r"^0.0001 cannot be met here: .* is within 0.00\d+$"):
+    with pytest.raises(ValueError, match=r"^0.0001 cannot be met here: .* is within 0.0\d+$"):
         found.choose(1e-4)
 
 
