@@ -139,8 +139,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
        - |float| or |string|
        - Largest root mean square error of an image in display space, from 0.00002 to below 1, also
          as "54 dB" or "0.5 steps" (of 8 bits). The cheapest approximations within it are found at
-         the first rendering, on windows of a few of the scene's sensors, and so are the samples of
-         an open shutter. Filters, falloff, ``alpha_max`` and ``extent`` stay. (Default: none)
+         the first rendering, by images of a few of the scene's sensors, and so are the samples of
+         an open shutter. Filters, falloff, ``alpha_max`` and ``extent`` stay. AOVs are not
+         measured. ``budget_report.stale`` names parameters that changed afterwards. (Default: none)
      * - projection, falloff, order, order_window, sh_direction, alpha_max, alpha_cut,
          transmittance_stop, extent, low_pass, antialiased
        - |string|, |int|, |float| or |bool|
@@ -359,13 +360,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
             from drgs.integrator.light.shadows import shade
 
             shade(self.state, scene)
-        if self.state.error is not None and self.state.budget_report is None:
-            from drgs.integrator.error_budget import meet_error_budget
+        if self.state.error is not None:
+            from drgs.integrator.error_budget import keep_error_budget
 
-            alone = self.state.cache.sensor
-            if sensors := scene.sensors() or ([] if alone is None else [alone]):
-                report = meet_error_budget(self.state, sensors, self.state.error)
-                mi.Log(mi.LogLevel.Info, report.line())  # pyright: ignore[reportCallIssue]  no type
+            keep_error_budget(self.state, scene)
 
 
 mi.register_integrator("splats", lambda props: SplatsIntegrator(props))

@@ -6,9 +6,13 @@ ray, and almost no cut-offs.
 
 Each approximation is measured alone, as the difference of two images that differ in nothing else.
 They are nearly independent, so that the squares of their errors add. What takes no order per pixel
-is measured on whole views; orders are, in a window of each (:meth:`Renderer.view`). There, the
+is measured on whole views; orders are, in a window of each (:class:`MeasuredView`). There, the
 cheapest combination within the budget is also compared with the most accurate image, which corrects
-the sum.
+the sum. Where all views are measured and small, nothing is estimated: windows are whole views, and
+choices are compared with the most accurate image, from the cheapest on.
+
+The most accurate image has an order within a window of splats: its own error, which is extrapolated
+from the windows before it, and among large splats measured along rays, is part of all errors.
 
 Costs are typical ones, not measured: the choice is the same in every run.
 """
@@ -17,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -25,27 +29,32 @@ import drjit as dr
 import numpy as np
 from scipy.stats import t as student_t
 
-from drgs.cameras.camera import Camera, cameras_in_time
+from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Pinhole
 from drgs.cameras.motion import MotionBlur
 from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
 from drgs.core.arrays import types_of
 from drgs.core.constants import ALPHA_CUT, MAX_SHUTTER_SAMPLES, TRANSMITTANCE_STOP
-from drgs.core.types import Float
 
 MIN_VIEWS, MAX_VIEWS = 3, 6  # that are measured, if there are so many
 MAX_PIXELS = 4_000_000  # of them together, unless they are the fewest
-WINDOW_PX = 140  # side of a window, at most about
+MAX_WHOLE_PIXELS = 1_000_000  # of all views together, for which nothing is estimated
+WINDOW_PX = 100  # side of a window, at most about
 AREA_SHARE = 0.2  # of the probability of a cell, by its area; the rest by its error
 CONFIDENCE = 0.95  # share of the views that shall be within the budget
 TYPICAL_SPREAD = 0.15  # of the logarithm of the errors of a file's views
 CLEARLY = 0.9  # of the error or the time of a choice, the next one's at most
 SPREAD_VIEWS = 6  # views that TYPICAL_SPREAD counts for
+SLACK = 1.5  # of predicted errors over the budget, up to which a choice is measured
+NEGLIGIBLE = 0.25  # of the budget: error of the most accurate image that is not worth a word
 
 SAMPLES = "shutter_samples"
 
 Changes = Mapping[str, Any]
 """Values of approximations by name, and of :data:`SAMPLES`."""
+
+Window = tuple[int, int, int, int]
+"""A part of the film: x, y, width and height, px."""
 
 
 @dataclass(frozen=True)
@@ -140,18 +149,25 @@ class BudgetReport:
     errors: tuple[float, ...]  # of the measured views
     better: Choice | None  # next choice with a clearly smaller error; None: there is none
     faster: Choice | None  # next choice that is clearly faster
+    most_accurate: Changes = field(default_factory=dict)  # of the images that errors refer to
+    uncertainty: float = 0.0  # error of these images themselves, part of all errors
+    stale: str = ""  # names of what has changed since; "": nothing
 
     def line(self) -> str:
         """Return one line for the user."""
         low, high = min(self.errors), max(self.errors)
+        errors = f"{low:.2g} to {high:.2g} at {len(self.errors)} views"
         line = (
-            f"error at most {self.budget:.2g}: {self.chosen.words}: {low:.2g} to {high:.2g} at "
-            f"{len(self.errors)} views, about {self.chosen.cost:.2g} times the time of the default"
+            f"error at most {self.budget:.2g}: {self.chosen.words}: "
+            f"{errors if len(self.errors) > 1 else f'{high:.2g} at 1 view'}, about "
+            f"{self.chosen.cost:.2g} times the time of the default"
         )
         for other in (self.faster, self.better):
             if other is not None:
                 line += f"; {other.cost:.2g} times for {other.error:.2g} ({other.words})"
-        return line
+        if self.uncertainty > NEGLIGIBLE * self.budget:
+            line += f"; the most accurate image is itself within {self.uncertainty:.2g} only"
+        return f"{line}; measured before a change of {self.stale}" if self.stale else line
 
     def record(self) -> dict[str, Any]:
         """Return the numbers to be recorded beside images, for JSON."""
@@ -168,6 +184,8 @@ class BudgetReport:
             "time_relative_to_default": self.chosen.cost,
             "next_better": numbers(self.better),
             "next_faster": numbers(self.faster),
+            "error_of_most_accurate": self.uncertainty,
+            "stale": self.stale,
         }
 
 
@@ -176,47 +194,17 @@ class MeasuredView:
     """A view that is measured, and the window in which orders are."""
 
     camera: Camera
-    rows: slice  # of the window
-    columns: slice
-    window: Camera
-    share: float  # probability with which the window was drawn
+    window: Window
+    share: float = 1.0  # probability with which the window was drawn
 
-    def mean_square(self, one: np.ndarray, other: np.ndarray) -> float:
-        """Return the mean square difference of the view from images (H, W, 3) of its window."""
-        total = float(np.square(one - other, dtype=np.float64).sum())
-        return total / self.share / (3 * self.camera.width * self.camera.height)
-
-
-@dataclass(frozen=True)
-class Renderer:
-    """Renders Gaussians with approximations that differ from given ones."""
-
-    planes: Callable[[Camera, Approximations], list[Float]]  # transmittance, red, green, blue
-    given: Approximations  # their filters and falloff are kept
-    background: tuple[float, float, float]  # display space
-
-    def image(self, camera: Camera, *changes: Changes) -> np.ndarray:
-        """Return (H, W, 3) float32, display space, not clamped."""
-        values = {k: v for change in changes for k, v in change.items()}
-        samples, images = values.pop(SAMPLES, 1), []
-        background = np.array(self.background, np.float32)
-        for one in cameras_in_time(camera, samples):
-            transmittance, *color = self.planes(one, replace(self.given, **values))
-            image = np.stack([np.array(plane) for plane in color], axis=-1)
-            images.append(image + np.array(transmittance)[:, None] * background)
-        return np.mean(images, axis=0).reshape(camera.height, camera.width, 3)
-
-    def view(self, camera: Camera, place: float) -> MeasuredView:
+    @staticmethod
+    def draw(camera: Camera, one: np.ndarray, other: np.ndarray, place: float) -> MeasuredView:
         """Return a view with a window; place: 0..1, of the window among the cells of the film.
 
-        Cells are drawn in proportion to the error of an order by one splat, and to a part to their
-        area: the mean over places of the errors of cells, divided by their shares, is the error of
-        the image.
+        Cells are drawn in proportion to the difference of two images of the view, of orders, and to
+        a part to their area: the mean over places of the errors of cells, divided by their shares,
+        is the error of the image.
         """
-        one, other = (
-            self.image(camera, CUT_OFFS[1].changes, order.changes)
-            for order in (CENTER, WINDOWED[0])
-        )
         error = np.square(one - other, dtype=np.float64).sum(axis=-1)
         rows, columns = (np.arange(0, size, _cell_size(size)) for size in error.shape)
         shares = AREA_SHARE * _sums(np.ones_like(error), rows, columns)
@@ -227,8 +215,36 @@ class Renderer:
         (y, x), (height, width) = divmod(int(cell), len(columns)), error.shape
         y, x = int(rows[y]), int(columns[x])
         end_y, end_x = min(y + _cell_size(height), height), min(x + _cell_size(width), width)
-        window = crop(camera, x, y, end_x - x, end_y - y)
-        return MeasuredView(camera, slice(y, end_y), slice(x, end_x), window, float(shares[cell]))
+        return MeasuredView(camera, (x, y, end_x - x, end_y - y), float(shares[cell]))
+
+    def cut(self, image: np.ndarray) -> np.ndarray:
+        """Return the window of an image of the view."""
+        x, y, width, height = self.window
+        return image[y : y + height, x : x + width]
+
+    def mean_square(self, one: np.ndarray, other: np.ndarray) -> float:
+        """Return the mean square difference of the view from images (H, W, 3) of its window."""
+        total = float(np.square(one - other, dtype=np.float64).sum())
+        return total / self.share / (3 * self.camera.width * self.camera.height)
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """Renders views with approximations that differ from given ones."""
+
+    draw: Callable[[Camera, Window | None, Approximations, int], np.ndarray]
+    """Returns the image (H, W, 3) float32 of a view or its window, in display space, not clamped;
+    the last argument is the number of times of an open shutter."""
+
+    given: Approximations  # their filters and falloff are kept
+    residual: Callable[[Camera, Window | None, Approximations], float]
+    """Returns the mean square error of the most accurate image, as far as it is known; or 0."""
+
+    def image(self, camera: Camera, *changes: Changes, window: Window | None = None) -> np.ndarray:
+        """Return the image of a view, or a window of it."""
+        values = {k: v for change in changes for k, v in change.items()}
+        samples = values.pop(SAMPLES, 1)
+        return self.draw(camera, window, replace(self.given, **values), samples)
 
 
 def _sums(values: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -298,77 +314,110 @@ class Search:
     def __init__(self, renderer: Renderer, cameras: Sequence[Camera]) -> None:
         """Measure each level alone on some views, and predict the errors of all combinations."""
         check_no_extensions(renderer.given)
-        pixels = max(camera.width * camera.height for camera in cameras)
-        cameras = [cameras[k] for k in measured_places(len(cameras), pixels)]
-        views = [renderer.view(one, (k + 0.5) / len(cameras)) for k, one in enumerate(cameras)]
-        self._renderer, self._views = renderer, views
-        self._images: dict[tuple[str, frozenset], list[np.ndarray]] = {}
-        projected = projections(cameras)
+        self._renderer = renderer
+        pixels = [camera.width * camera.height for camera in cameras]
+        places = measured_places(len(cameras), max(pixels))
+        measured = [cameras[k] for k in places]
+        is_complete = len(places) == len(cameras) and sum(pixels) <= MAX_WHOLE_PIXELS
+        self.bound: Callable[[np.ndarray], float] = max if is_complete else bound
+        """The error of all views, from those of the measured ones."""
+        self._images: dict[tuple, np.ndarray] = {}
+        projected = projections(measured)
         first = projected[0], CENTER, DIRECTIONS[0], CUT_OFFS[1]
         self._start = {k: v for level in first for k, v in level.changes.items()}
-        orders = self._squares_of_orders()
+        self._views = [MeasuredView(one, (0, 0, one.width, one.height)) for one in measured]
+        if not is_complete:
+            self._views = [
+                MeasuredView.draw(
+                    camera,
+                    *(self._image(k, order, True) for order in ({}, WINDOWED[0].changes)),
+                    (k + 0.5) / len(measured),
+                )
+                for k, camera in enumerate(measured)
+            ]
+        last = projected[-1], WINDOWED[-1], DIRECTIONS[-1]
+        self._best = {k: v for level in last for k, v in level.changes.items()} | FINEST_CUT_OFFS
+        self._orders = self._squares_of_orders()
         squares = [
-            orders,
+            self._orders,
             self._squares(projected, projected[-1].changes),
             self._squares(DIRECTIONS, DIRECTIONS[-1].changes),
             self._squares(CUT_OFFS, FINEST_CUT_OFFS),
         ]
-        samples = shutter_samples(cameras)
+        samples = shutter_samples(measured)
         self._most_samples = {SAMPLES: 2 * samples[-1].changes[SAMPLES]} if samples else {}
         if samples:
             squares.append(self._squares(samples, self._most_samples))
-        self.front = _front(renderer.given, squares)
+        self.front = self._front(squares)
         """Combinations that no other one beats in cost and predicted error, by cost."""
-        finest = orders[-1]
-        self._unordered = finest.of_views
-        last = projected[-1], finest.level, DIRECTIONS[-1]
-        best = {k: v for level in last for k, v in level.changes.items()}
-        self._references = self._in_windows({**best, **FINEST_CUT_OFFS})
 
-    def _of_views(self, changes: Changes) -> list[np.ndarray]:
-        """Return the images of the views, with the cheapest approximations but for ``changes``."""
-        return self._render("camera", {**self._start, **changes})
+    def _image(self, k: int, changes: Changes, is_whole: bool) -> np.ndarray:
+        """Return view k or its window, with the cheapest approximations but for ``changes``."""
+        values, view = {**self._start, **changes}, self._views[k]
+        key, images = (k, frozenset(values.items())), self._images
+        if is_whole or self.bound is max or key in images:
+            if key not in images:
+                images[key] = self._renderer.image(view.camera, values)
+            return images[key] if is_whole else view.cut(images[key])
+        key = (*key, view.window)
+        if key not in images:
+            images[key] = self._renderer.image(view.camera, values, window=view.window)
+        return images[key]
 
-    def _in_windows(self, changes: Changes) -> list[np.ndarray]:
-        """Return the images of the windows, likewise."""
-        values = {**self._start, **changes}
-        if values["order"] == CENTER.changes["order"]:
-            pairs = zip(self._of_views(changes), self._views, strict=True)
-            return [image[view.rows, view.columns] for image, view in pairs]
-        return self._render("window", values)
-
-    def _render(self, camera: str, values: Changes) -> list[np.ndarray]:
-        """Render once; camera: the attribute of :class:`MeasuredView`."""
-        key = camera, frozenset(values.items())
-        if key not in self._images:
-            cameras = [getattr(view, camera) for view in self._views]
-            self._images[key] = [self._renderer.image(one, values) for one in cameras]
-        return self._images[key]
-
-    def _differences(self, changes: Changes, target: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the mean square differences (V,) of the views, from those of the windows."""
-        triples = zip(self._views, self._in_windows(changes), target, strict=True)
-        return np.array([view.mean_square(one, other) for view, one, other in triples])
+    def _differences(self, changes: Changes, target: Changes, step: int = 1) -> np.ndarray:
+        """Return the mean square differences (V,) of views, from those of their windows."""
+        return np.array(
+            [
+                view.mean_square(self._image(k, changes, False), self._image(k, target, False))
+                for k, view in enumerate(self._views)
+                if k % step == 0
+            ]
+        )
 
     def _squares(self, levels: Sequence[Level], finest: Changes) -> list[LevelSquares]:
-        exact, found = self._of_views(finest), []
+        """Return those of levels, of every other view for two unless nothing is estimated."""
+        count, found = len(self._views), []
+        step = 1 if self.bound is max else 2
         for level in levels:
-            pairs = zip(self._of_views(level.changes), exact, strict=True)
-            squares = [np.square(one - other, dtype=np.float64).mean() for one, other in pairs]
-            in_windows = self._differences(level.changes, self._in_windows(finest))
-            found.append(LevelSquares(level, np.array(squares), in_windows))
+            squares = [
+                np.square(self._image(k, level.changes, True) - self._image(k, finest, True)).mean()
+                for k in range(0, count, step)
+            ]
+            pair = squares, self._differences(level.changes, finest, step)
+            found.append(LevelSquares(level, *(np.repeat(each, step)[:count] for each in pair)))
         return found
 
     def _squares_of_orders(self) -> list[LevelSquares]:
-        """Return those of orders; the last one's is extrapolated from the two windows before it."""
-        levels, target = (CENTER, *WINDOWED[:-1]), self._in_windows(WINDOWED[-1].changes)
+        """Return those of orders; all contain the errors of the most accurate image.
+
+        These are extrapolated from two windows of splats, or what the renderer has found.
+        """
+        levels, target = (CENTER, *WINDOWED), WINDOWED[-1].changes
         squares = [self._differences(level.changes, target) for level in levels]
-        before, last = squares[-2:]
-        squares.append(last * np.minimum(last / np.maximum(before, 1e-20), 0.5))
-        return [
-            LevelSquares(level, found, found)
-            for level, found in zip((CENTER, *WINDOWED), squares, strict=True)
-        ]
+        *_, before, last, _ = squares
+        rest, values = last / np.maximum(before, 1e-20), replace(self._renderer.given, **self._best)
+        found = [self._renderer.residual(one.camera, one.window, values) for one in self._views]
+        self._unordered = np.maximum(last * np.minimum(rest, 0.5), found)
+        sums = [each + self._unordered for each in squares]
+        return [LevelSquares(level, each, each) for level, each in zip(levels, sums, strict=True)]
+
+    def _front(self, squares: Sequence[Sequence[LevelSquares]]) -> list[Combination]:
+        found = []
+        for levels in product(*squares):
+            changes = {k: v for each in levels for k, v in each.level.changes.items()}
+            is_ordered = changes["order"] != "center"
+            cost = math.prod(each.level.factor(is_ordered) for each in levels)
+            of_views = np.sum([each.of_views for each in levels], axis=0)
+            in_windows = np.sum([each.in_windows for each in levels], axis=0)
+            values = {k: v for k, v in changes.items() if k != SAMPLES}
+            approximations = replace(self._renderer.given, **values)
+            choice = Choice(approximations, changes, self.bound(np.sqrt(of_views)), cost)
+            found.append(Combination(choice, of_views, in_windows))
+        front: list[Combination] = []
+        for one in sorted(found, key=lambda one: (one.choice.cost, one.choice.error)):
+            if not front or one.choice.error < front[-1].choice.error:
+                front.append(one)
+        return front
 
     def choose(self, budget: float) -> BudgetReport:
         """Return the cheapest approximations within ``budget``; ValueError if there are none."""
@@ -382,21 +431,27 @@ class Search:
             tuple(of_views),
             next((one for one in front[place:] if one.error < CLEARLY * chosen.error), None),
             next((one for one in front[place::-1] if one.cost < CLEARLY * chosen.cost), None),
+            self._best | self._most_samples,
+            math.sqrt(self._unordered.max()),
         )
 
-    def correction(self, place: int) -> float:
-        """Return the measured square error in the windows, relative to the sum of the levels'.
+    def measure(self, place: int) -> np.ndarray:
+        """Return the measured square errors (V,) of a choice in the windows; place: in ``front``.
 
-        place: in ``front``. The errors of the most accurate image, and of the times of a shutter,
-        are added.
+        The errors of the most accurate image, and of the times of a shutter, are added. In windows
+        of the views, the last but one order is accurate enough for those before it.
         """
-        candidate = self.front[place]
+        candidate, best, rest = self.front[place], self._best, self._unordered
         changes = {k: v for k, v in candidate.choice.changes.items() if k != SAMPLES}
-        measured = self._differences(changes, self._references) + self._unordered
+        *_, other, _ = self._orders
+        is_before = all(changes != changes | one.changes for one in WINDOWED[-2:])
+        if self.bound is not max and is_before:
+            best, rest = best | other.level.changes, other.in_windows
+        measured = self._differences(changes, best) + rest
         if self._most_samples:
             samples = {SAMPLES: candidate.choice.changes[SAMPLES]}
-            measured += self._differences(samples, self._in_windows(self._most_samples))
-        return float(measured.sum() / max(candidate.in_windows.sum(), 1e-30))
+            measured += self._differences(samples, self._most_samples)
+        return measured
 
     def cheapest(self, budget: float) -> tuple[int, list[float], list[float]]:
         """Return the place in ``front`` of the cheapest choice within a budget.
@@ -405,19 +460,21 @@ class Search:
         measured, of other choices by what was measured last. Raises ValueError if no choice is
         within the budget.
         """
-        corrections: dict[int, float] = {}  # of this budget: the choice depends on no other one
+        found: dict[int, np.ndarray] = {}  # of this budget: the choice depends on no other one
         correction, last = 1.0, len(self.front) - 1
+        slack = SLACK if self.bound is max else 1.0
         while True:
-            errors = [
-                bound(np.sqrt(corrections.get(k, correction) * candidate.of_views))
-                for k, candidate in enumerate(self.front)
-            ]
-            place = next((k for k, error in enumerate(errors) if error <= budget), last)
-            if place not in corrections:
-                correction = corrections[place] = self.correction(place)
+            squares = [found.get(k, correction * c.of_views) for k, c in enumerate(self.front)]
+            errors = [self.bound(np.sqrt(each)) for each in squares]
+            limits = (budget if k in found else slack * budget for k in range(last + 1))
+            pairs = enumerate(zip(errors, limits, strict=True))
+            place = next((k for k, (error, limit) in pairs if error <= limit), last)
+            if place not in found:
+                measured, predicted = self.measure(place), self.front[place]
+                correction = float(measured.sum() / max(predicted.in_windows.sum(), 1e-30))
+                found[place] = measured if slack > 1 else correction * predicted.of_views
             elif errors[place] <= budget:
-                of_views = np.sqrt(corrections[place] * self.front[place].of_views)
-                return place, of_views.tolist(), errors
+                return place, np.sqrt(found[place]).tolist(), errors
             else:
                 raise ValueError(
                     f"{budget:.2g} cannot be met here: the most accurate choice is within "
@@ -428,25 +485,6 @@ class Search:
 def _rounded_up(error: float) -> str:
     digits = 1 - math.floor(math.log10(error))
     return f"{math.ceil(error * 10**digits) / 10**digits:g}"
-
-
-def _front(given: Approximations, squares: Sequence[Sequence[LevelSquares]]) -> list[Combination]:
-    """Return the combinations that no other one beats in cost and error, by cost."""
-    found = []
-    for levels in product(*squares):
-        changes = {k: v for each in levels for k, v in each.level.changes.items()}
-        is_ordered = changes["order"] != "center"
-        cost = math.prod(each.level.factor(is_ordered) for each in levels)
-        of_views = np.sum([each.of_views for each in levels], axis=0)
-        in_windows = np.sum([each.in_windows for each in levels], axis=0)
-        approximations = replace(given, **{k: v for k, v in changes.items() if k != SAMPLES})
-        choice = Choice(approximations, changes, bound(np.sqrt(of_views)), cost)
-        found.append(Combination(choice, of_views, in_windows))
-    front: list[Combination] = []
-    for one in sorted(found, key=lambda one: (one.choice.cost, one.choice.error)):
-        if not front or one.choice.error < front[-1].choice.error:
-            front.append(one)
-    return front
 
 
 def check_no_extensions(given: Approximations) -> None:

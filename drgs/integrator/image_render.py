@@ -231,6 +231,7 @@ class SensorRender:
     key: object  # of the positions: see drgs.integrator.film.CenterSamples
     has_alpha: bool
     nested: NestedSurfaces | None  # the part of surfaces, if there are any
+    window: mi.Film | None = None  # a film whose size and crop window hold instead of the sensor's
 
     def planes(self) -> Planes:
         """Return the planes of all frames, unevaluated."""
@@ -383,7 +384,7 @@ class SensorRender:
         cameras = [of_time[0].camera for of_time in self.frames]
         if state.is_attached:
             cameras = self._attached_cameras(state)
-        colors = radiance = background_radiance(self.sensor.film(), behind, cameras, self._offsets)
+        colors = radiance = background_radiance(self._film, behind, cameras, self._offsets)
         if environment is None or not splats.srgb_primitives:
             colors = [[mi.math.linear_to_srgb(color) for color in of_time] for of_time in colors]
         return _Background(colors, environment is not None, radiance)
@@ -449,7 +450,7 @@ class SensorRender:
             lambda: trace_surfaces(
                 nested.rays,
                 far,
-                self.sensor.film(),
+                self._film,
                 self._cameras(state),
                 self._offsets,
                 with_normals="normal" in self.splats.aovs.values(),
@@ -466,7 +467,13 @@ class SensorRender:
         return [(p.x, p.y) if isinstance(p, SamplePoints) else (0.5, 0.5) for p in self.positions]
 
     def _state(self) -> SensorState:
-        return read_sensor(self.sensor, self.splats.near)
+        state, film = read_sensor(self.sensor, self.splats.near), self._film
+        place = *film.size(), *film.crop_offset(), *film.crop_size()
+        return replace(state, host=(*place, state.host[-1]))
+
+    @property
+    def _film(self) -> mi.Film:
+        return self.window or self.sensor.film()
 
     @cached_property
     def _camera_state(self) -> SensorState:

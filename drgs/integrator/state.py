@@ -161,6 +161,7 @@ class SplatsState:
     lighting: LightSettings
     given_error: float | None  # budget of the approximations' error; None: as they are given
     budget_report: Any = None  # drgs.accuracy.error_budget.BudgetReport, once it was met
+    budget_evidence: Any = None  # drgs.integrator.error_budget.Evidence: what it was measured on
     cache: RenderCache = field(default_factory=RenderCache)
     projected_view: ProjectedView | None = None  # rendered instead of the Gaussians
 

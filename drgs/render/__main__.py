@@ -56,7 +56,7 @@ CAMERA_OPTIONS = {
 }
 """Options that each way of placing cameras uses."""
 
-MODEL_OPTIONS = {"scene", "data", "set", "background", "ignore"}
+MODEL_OPTIONS = {"scene", "data", "set", "background", "ignore", "error_image"}
 
 ALL_OPTIONS = {"define", *CAMERA_OPTIONS, *CAMERA_OPTIONS["origin"], *MODEL_OPTIONS}
 
@@ -156,6 +156,12 @@ def _add_settings(parser: CommandParser) -> None:
     add_background(group)
     add_error(group)
     group.add_argument(
+        "--error-image",
+        action="store_const",
+        const=True,
+        help="write the error at each pixel beside each image, as colours (NAME.error.png)",
+    )
+    group.add_argument(
         "--ignore",
         nargs="+",
         choices=IGNORABLE,
@@ -200,13 +206,16 @@ def run_with_arguments(args: argparse.Namespace, render: Render) -> None:
             overrides, background = [*(args.set or ()), *data], parse_background(args.background)
             effects = args.ignore or ()
             model = load_model(args.what, args.scene, overrides, background, effects, render)
-            render_model(args, replace(model, error=args.error), folder)
+            model = replace(model, error=args.error, error_images=bool(args.error_image))
+            render_model(args, model, folder)
         print(f"written: {args.out}")
 
 
 def _check(args: argparse.Namespace) -> None:
     """Refuse arguments that conflict, before anything is read or written."""
     what = args.what
+    if args.error_image and args.error is None:
+        raise UserError("--error-image: needs --error ERROR")
     if not what.exists():
         raise UserError(f"{what}: there is no such file or folder")
     if not what.is_dir():
@@ -257,7 +266,7 @@ def _check_cameras(args: argparse.Namespace) -> None:
 def _check_options(args: argparse.Namespace, used: set[str], context: str) -> None:
     for name in sorted(ALL_OPTIONS - used):
         if getattr(args, name) is not None:
-            raise UserError(f"--{name}: is not used with {context}")
+            raise UserError(f"--{name.replace('_', '-')}: is not used with {context}")
 
 
 def _definition(word: str) -> tuple[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -33,7 +34,7 @@ from drgs.integrator.scene import (
     make_sensors,
     render_views,
 )
-from drgs.integrator.state import SplatsState, is_splats
+from drgs.integrator.state import is_splats
 from drgs.integrator.summary import format_effects, summary_of_views
 from drgs.io.images import write_png
 from drgs.results.folder import CONFIG, ERROR_BUDGET, GAUSSIANS, relocate_data, require_results
@@ -49,6 +50,8 @@ Render = Callable[..., Iterator[np.ndarray]]
 
 COMMAND = "render"
 BUDGET_KEY = "drgs error budget"  # of images' metadata
+ERROR_SUFFIX = ".error.png"  # of the picture of an image's error
+BRIGHTEST_ERROR = 4  # budgets: error of a pixel that has the brightest colour
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr")
 
 Image = TypeVar("Image")
@@ -121,10 +124,11 @@ class Model:
     background: Background
     config: FitConfig | None  # names the dataset
     ignored: str = ""  # effects not simulated: see the plugin
-    folder: Path | None = None  # of the file, with optional refined cameras
+    path: Path | None = None  # of the file, beside which there may be refined cameras
     from_header: Collection[str] = ()  # names of settings from the file's header
     render: Render = render_views
     error: float | None = None  # budget of the approximations' error; None: as ``settings``
+    error_images: bool = False  # whether pictures of the error are written as well
 
     def scene(self) -> mi.Scene:
         """Return a Mitsuba scene that renders in display space."""
@@ -148,27 +152,61 @@ class Model:
         print(format_effects(summary), flush=True)
         names = [*(f"{view.name}.png" for view in views), *others]
         if self.error is not None:
-            folder.budget = self.meet_error_budget(integrator.state, views)
+            folder.budget = self.meet_error_budget(scene, views)
             names.append(ERROR_BUDGET)
-        return folder.claim(names, self.render(scene, views))
+        if self.error_images:
+            names += [f"{view.name}{ERROR_SUFFIX}" for view in views]
+        images = folder.claim(names, self.render(scene, views))
+        return self._with_errors(views, folder, images) if self.error_images else images
 
-    def meet_error_budget(self, splats: SplatsState, views: Sequence[Viewpoint]) -> BudgetReport:
+    def meet_error_budget(self, scene: mi.Scene, views: Sequence[Viewpoint]) -> BudgetReport:
         """Set approximations within the error; print and return what was found."""
-        from drgs.integrator.error_budget import meet_error_budget
+        from drgs.integrator.error_budget import digest_of, meet_error_budget
+        from drgs.results.budget_memory import memory_path, recall, remember
 
-        assert self.error is not None
-        try:
-            report = meet_error_budget(splats, make_sensors(views), self.error)
-        except PluginError as error:
-            raise UserError(f"--{str(error).removeprefix('splats: ')}") from None
+        integrator, sensors = scene.integrator(), make_sensors(views)
+        assert self.error is not None and is_splats(integrator), "scene() sets it"
+        splats, path = integrator.state, self.path and memory_path(self.path)
+        digest = f"{self.error} {digest_of(splats, scene, sensors)}"
+        report = splats.budget_report = recall(path, digest, splats.given_approximations)
+        if report is None:
+            try:
+                report = meet_error_budget(splats, scene, sensors, self.error)
+            except PluginError as error:
+                raise UserError(f"--{str(error).removeprefix('splats: ')}") from None
+            remember(path, digest, report)
         print(report.line(), flush=True)
         return report
 
+    def _with_errors(
+        self, views: Sequence[Viewpoint], folder: ImageFolder, images: Iterator[np.ndarray]
+    ) -> Iterator[np.ndarray]:
+        """Yield the images; write each pixel's root mean square error over channels, as colours."""
+        from matplotlib import colormaps
+
+        assert folder.budget is not None, "errors are relative to its most accurate image"
+        report, changes = folder.budget, {**folder.budget.most_accurate}
+        if (samples := changes.pop("shutter_samples", 0)) > 0:
+            motions = [one.motion and replace(one.motion, samples=samples) for one in views]
+            views = [replace(one, motion=m) for one, m in zip(views, motions, strict=True)]
+        settings = self.settings.model_copy(update=changes)
+        exact = render_views(replace(self, settings=settings).scene(), views)
+        brightest = BRIGHTEST_ERROR * report.budget
+        for view, image in zip(views, images, strict=True):
+            square = np.square(image - next(exact), dtype=np.float64).mean(axis=-1)
+            colors = colormaps["inferno"](np.sqrt(square) / brightest)[..., :3]
+            folder.write_png(f"{view.name}{ERROR_SUFFIX}", colors)
+            print(
+                f"{view.name}{ERROR_SUFFIX}: {math.sqrt(square.mean()):.2g}, at most "
+                f"{math.sqrt(square.max()):.2g} (brightest from {brightest:.2g}), for "
+                f"{report.chosen.cost:.2g} times the time of the default",
+                flush=True,
+            )
+            yield image
+
     def within_error(self, error: float, views: Sequence[Viewpoint]) -> Model:
         """Return this with approximations within an error at the views; print what was found."""
-        integrator = self.scene().integrator()
-        assert is_splats(integrator), "scene() sets it"
-        report = replace(self, error=error).meet_error_budget(integrator.state, views)
+        report = replace(self, error=error).meet_error_budget(self.scene(), views)
         return replace(self, settings=self.settings.model_copy(update=report.chosen.changes))
 
     def dataset(self, option: str) -> Dataset:
@@ -179,7 +217,7 @@ class Model:
             )
         dataset = load_dataset(self.config.data_for_rendering, sections=self.config.sections)
         dataset = dataset.relative_to(self.gaussians.origin)
-        if self.folder is None or not (path := self.folder / CAMERAS).is_file():
+        if self.path is None or not (path := self.path.parent / CAMERAS).is_file():
             return dataset
         if not self.config.section("cameras", CamerasConfig).optimise:
             print(
@@ -188,7 +226,7 @@ class Model:
             )
             return dataset
         print(f"cameras: as refined, from {path}")
-        return refined_dataset(dataset, self.folder)
+        return refined_dataset(dataset, self.path.parent)
 
 
 def load_model(
@@ -229,7 +267,7 @@ def load_model(
         default_background if background is None else background,
         config,
         ", ".join(ignored),
-        path.parent,
+        path,
         tuple(values),
         render,
     )

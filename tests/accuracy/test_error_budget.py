@@ -2,12 +2,15 @@
 
 import argparse
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import drjit.llvm.ad as llvm
 import mitsuba as mi
 import numpy as np
 import pytest
+from matplotlib import colormaps
 from PIL import Image
 from support.commands import assert_refused
 from support.render_command import run, sensor, write_scene
@@ -20,15 +23,18 @@ from drgs.bench.scenes import device_camera
 from drgs.cameras.lens import LENSES
 from drgs.cameras.viewpoints import OPENCV_TO_MITSUBA
 from drgs.config.approximations import FALLOFFS, Approximations, parse_error
-from drgs.core.errors import PluginError
+from drgs.core.errors import PluginError, UserError
 from drgs.core.registry import temporary_registrations
 from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.integrator import error_budget as error_budget_of_scenes
 from drgs.integrator.error_budget import renderer_of
 from drgs.integrator.scene import film_description
 from drgs.io.scenes import openexr_threads
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.render import __main__ as render
+from drgs.render.images import viewpoints_of
+from drgs.results import budget_memory
 from drgs.results.model import load_model
 from drgs.splatting.footprint import GaussianFalloff
 from drgs.view import __main__ as view
@@ -150,7 +156,7 @@ def test_wrong_budgets_are_refused(given):
 
 @pytest.mark.slow
 def test_impossible_budgets_say_what_is_possible(found):
-    with pytest.raises(ValueError, match=r"^0.0001 cannot be met here: .* is within 0.00\d+$"):
+    with pytest.raises(ValueError, match=r"^0.0001 cannot be met here: .* is within 0.0\d+$"):
         found.choose(1e-4)
 
 
@@ -238,6 +244,117 @@ def test_render_records_the_choice_beside_images(tmp_path, fit):
     assert max(record["measured_errors"]) <= record["budget"]
     for path in (tmp_path / "out").glob("*.png"):
         assert json.loads(Image.open(path).text["drgs error budget"]) == record
+
+
+@pytest.fixture
+def copied(fit, tmp_path):
+    """A file of its own, and how often a choice for it was searched."""
+    path = tmp_path / "copy" / "point_cloud.ply"
+    path.parent.mkdir()
+    shutil.copy(fit / "point_cloud.ply", path)
+    return path
+
+
+def memory_of(path):
+    return path.with_name("point_cloud.ply.error_budgets.json")
+
+
+def record_of(path, out, *words):
+    run(path, "--orbit", 2, "--out", out, *words)
+    return json.loads((out / "error_budget.json").read_text())
+
+
+def test_choices_are_remembered_beside_the_file(copied, tmp_path, monkeypatch):
+    found = record_of(copied, tmp_path / "out", "--error", 0.01)
+    files = {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.png")}
+    search = error_budget_of_scenes.Search
+
+    def refuse(*args):
+        raise AssertionError("a choice that is remembered is not searched")
+
+    monkeypatch.setattr(error_budget_of_scenes, "Search", refuse)
+    assert record_of(copied, tmp_path / "again", "--error", 0.01) == found
+    for name, content in files.items():
+        assert (tmp_path / "again" / name).read_bytes() == content
+    others = [("--error", 0.02), ("--error", 0.01, "--background", "white")]
+    others += [("--error", 0.01, "--size", 64, 48), ("--error", 0.01, "--fov", 50)]
+    for words in others:
+        with pytest.raises(AssertionError, match="not searched"):
+            record_of(copied, tmp_path / "others", *words)
+    content = copied.read_bytes()
+    copied.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    with pytest.raises(AssertionError, match="not searched"):
+        record_of(copied, tmp_path / "changed", "--error", 0.01)
+    monkeypatch.setattr(error_budget_of_scenes, "Search", search)
+    copied.write_bytes(content)
+    damaged = memory_of(copied).read_text()
+    for text in (damaged[:-20], damaged.replace('"error": ', '"error": "x", "e": '), "[]", ""):
+        memory_of(copied).write_text(text)
+        assert record_of(copied, tmp_path / "out", "--error", 0.01) == found
+
+
+@pytest.mark.parametrize("content", ["notes of mine", '{"mine": 1}'])
+def test_files_of_others_are_not_overwritten(copied, tmp_path, content):
+    memory_of(copied).write_text(content)
+    record_of(copied, tmp_path / "out", "--error", 0.01)
+    assert memory_of(copied).read_text() == content
+
+
+def test_a_folder_that_cannot_be_written_is_no_error(copied, tmp_path, monkeypatch):
+    def refuse(path, content):
+        raise UserError("read-only")
+
+    monkeypatch.setattr(budget_memory, "write_json", refuse)
+    record_of(copied, tmp_path / "out", "--error", 0.01)
+    assert not memory_of(copied).exists()
+    shipped = Path(budget_memory.drgs.EXAMPLE)
+    assert budget_memory.memory_path(shipped) is None
+
+
+def test_error_images_show_where_errors_are(copied, tmp_path, capsys):
+    """Against the float64 reference of exact images; 4 budgets are the brightest colour."""
+    run(
+        copied, "--origin", 0, -3, 1, "--size", 40, 32, "--error", 0.05, "--error-image",
+        "--out", tmp_path / "out",
+    )  # fmt: skip
+    shown = np.asarray(Image.open(tmp_path / "out" / "camera.error.png"), np.float64) / 255
+    model = load_model(copied)
+    (camera,) = viewpoints_of(
+        argparse.Namespace(
+            camera=None, origin=[0, -3, 1], target=None, up=None, fov=None, size=[40, 32],
+            panorama=None,
+        ), model,
+    )  # fmt: skip
+    of_numpy = reference.Gaussians(*(getattr(model.gaussians, name) for name in PARAMETER_NAMES))
+    pose = camera.camera_to_world
+    exact = reference_rays.render(
+        of_numpy,
+        reference.Camera(
+            pose[:3, :3].T, pose[:3, 3], camera.fx, camera.fy, camera.cx, camera.cy, 40, 32,
+            model.settings.near_plane,
+        ),
+        BLACK,
+        reference_rays.ImageModel(
+            projection="exact", order="pixel", sh_direction="pixel", alpha_cut=1e-6,
+            transmittance_stop=0.0, low_pass=model.settings.low_pass,
+            antialiased=model.settings.antialiased,
+        ),
+    ).image  # fmt: skip
+    image = np.asarray(Image.open(tmp_path / "out" / "camera.png"), np.float64) / 255
+    error = np.sqrt(np.mean((image - np.clip(exact, 0, 1)) ** 2, axis=-1))
+    expected = colormaps["inferno"](error / 0.2)[..., :3]
+    # Half a level of 8 bits is 2.5 of the 256 colours, each a step of 0.02 at most.
+    assert np.abs(shown - expected).max() < 0.06
+    assert error.max() > 0.02, "a scene with errors"
+    total = np.sqrt(np.mean(error**2))
+    line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("camera.error"))
+    assert float(line.split()[1].rstrip(",")) == pytest.approx(total, rel=0.1)
+    assert "(brightest from 0.2)" in line
+
+
+def test_error_images_need_a_budget(copied, tmp_path):
+    words = (copied, "--orbit", 2, "--error-image", "--out", tmp_path / "out")
+    assert_refused(render.main, *words, folder=tmp_path / "out", message="needs --error ERROR")
 
 
 def test_viewers_show_images_within_the_budget(fit, capsys):

@@ -121,7 +121,8 @@ def test_depth_alpha_and_normal_include_surfaces_and_splats():
     np.testing.assert_allclose(image[..., :4], rgba(scene), rtol=0, atol=IMAGE * 2)
     np.testing.assert_allclose(image[..., 4], planes["depth"], rtol=0, atol=IMAGE * 4)
     np.testing.assert_allclose(image[..., 5], planes["alpha"], rtol=0, atol=IMAGE)
-    # The normals of splats are 0 where they are all transparent, and the wall's is added.
+    # The normals of splats are 0 where they are all transparent, and the wall's is added. It points
+    # to the camera, also where the wall is seen from behind.
     bare = {"logit_opacities": mi.TensorXf(np.full(scene.count, -20, np.float32))}
     bare["feature_x"] = mi.TensorXf(np.ones((scene.count, 1), np.float32))
     image = image_of(load(scene, aovs="n:normal, f:feature_x", **bare))
@@ -129,6 +130,9 @@ def test_depth_alpha_and_normal_include_surfaces_and_splats():
     np.testing.assert_allclose(feature, 0, atol=IMAGE)
     normal = scene.camera.rotation.T @ WALL.axes()[2]
     np.testing.assert_allclose(normals, np.broadcast_to(normal, normals.shape), atol=IMAGE)
+    behind = {"wall": WALL.shape(scene.view.camera, flip_normals=True)}
+    image = image_of(load(scene, wall=None, shapes=behind, aovs="n:normal", **bare))
+    np.testing.assert_allclose(image[..., 4:7], normals, atol=IMAGE)
 
 
 @pytest.mark.parametrize("rfilter", ["gaussian", "tent"])

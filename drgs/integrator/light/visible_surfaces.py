@@ -29,7 +29,7 @@ MISSING_SURFACE_DEPTH = 1e30  # depth of a missing surface: behind all splats, a
 class VisibleSurface(Surface):
     """A visible surface at each pixel."""
 
-    normal: mi.Normal3f | None  # world, times the coverage; None where no AOV needs it
+    normal: mi.Normal3f | None  # world, to the camera, times the coverage; None: no AOV needs it
 
     def gather(self, pixel: mi.UInt32) -> VisibleSurface:
         """Return the surfaces of some pixels."""
@@ -151,7 +151,8 @@ class _Tracer:
         normal = None
         if self.with_normals:
             frame = hit.compute_surface_interaction(ray, mi.RayFlags.ShadingFrame, valid).sh_frame
-            normal = dr.select(valid, coverage * mi.Normal3f(frame.n), 0)
+            towards = dr.select(dr.dot(frame.n, ray.d) > 0, -frame.n, frame.n)
+            normal = dr.select(valid, coverage * mi.Normal3f(towards), 0)
         return VisibleSurface(dr.select(valid, depth, MISSING_SURFACE_DEPTH), coverage, normal)
 
     def trace_with_edges(
