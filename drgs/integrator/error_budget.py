@@ -45,6 +45,7 @@ from drgs.splatting.footprint import PixelCenters
 from drgs.splatting.projection import load_rows
 
 PATHS = 16  # per pixel, of the radiance of surfaces
+APERTURE_POINTS = 32
 RESIDUAL_PX = 48  # side of the part of a window in which rays are traced
 FILM_NUMBERS = ("width", "height", "crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
 LARGE = 0.25  # standard deviation of a splat relative to its depth, whose order is hard to find
@@ -87,13 +88,15 @@ def ray_residual(
     Rays composite all Gaussians in the order of their peaks (:mod:`drgs.light.walk`), over black or
     white, without the low-pass filter, which rays do not have. Filtered images differ less: as much
     as those of half the window of splats do, with it and without. 0 where no visible Gaussian is
-    :data:`LARGE`, and for cameras that blur.
+    :data:`LARGE`, and for cameras that move. With an aperture, see :func:`aperture_residual`.
     """
+    if camera.aperture is not None:
+        return aperture_residual(gaussians, sh_degree, crop(camera, *window), approximations)
     rows, t = load_rows(gaussians, sh_degree), types_of(type(camera.near))
-    depth = (camera.rotation @ (rows.means - camera.center)).z
-    visible = depth > camera.near
-    is_blurred = camera.aperture is not None or camera.shutter is not None
-    if is_blurred or not dr.any(visible & (dr.exp(dr.max(rows.log_scales)) > LARGE * depth)):
+    position = camera.rotation @ (rows.means - camera.center)
+    visible, _, depth = camera.lens.visibility(camera, position)
+    is_large = dr.exp(dr.max(rows.log_scales)) > LARGE * depth
+    if camera.shutter is not None or not dr.any(visible & is_large):
         return 0.0
     x, y, *sides = window
     left, top = (max(side - RESIDUAL_PX, 0) // 2 for side in sides)
@@ -125,6 +128,25 @@ def ray_residual(
     rest, *color = sharp - np.array([np.array(plane) for plane in (rest, *color)], np.float64)
     square = max(float(np.mean(np.square(color + white * rest))) for white in (0, 1))
     return square * float(min(changes[0] / max(changes[1], 1e-20), 1.0) if low_pass else 1.0)
+
+
+def aperture_residual(
+    gaussians: Gaussians, sh_degree: int, camera: Camera, approximations: Approximations
+) -> float:
+    """Return the mean square difference from the mean of pinholes' images, all over an aperture.
+
+    Over black or white, in the order of the means.
+    """
+    pipeline = pipeline_of(replace(approximations, order="center"), sh_degree)
+
+    def planes(one: Camera) -> np.ndarray:
+        frame = rendering.render(gaussians, one, with_effects(pipeline, gaussians, one))
+        return np.array([np.array(plane) for plane in frame.planes()], np.float64)
+
+    assert camera.aperture is not None, "that of the camera"
+    pinholes = camera.aperture.cameras(camera, APERTURE_POINTS)
+    rest, *color = planes(camera) - np.mean([planes(one) for one in pinholes], axis=0)
+    return max(float(np.mean(np.square(color + white * rest))) for white in (0, 1))
 
 
 @dataclass(frozen=True, eq=False)
