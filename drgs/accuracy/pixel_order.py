@@ -120,7 +120,9 @@ class PixelOrder(CenterOrder):
 
         T, C = _walk(
             inputs,
-            carry=lambda met, pixel: model.features.pixel_values(met.features, pixel),
+            carry=lambda met, pixel: model.features.pixel_values(
+                met.features_at(pixel, model), pixel
+            ),
             visit=visit,
             state=(inputs.transmittance(), inputs.zeros(count)),
             nothing=[dr.zeros(t.Float, size)] * count,
@@ -164,8 +166,8 @@ class PixelOrder(CenterOrder):
             alpha = met.alphas[pixel]
             return [
                 dr.select(alpha.smooth, alpha.value * d_log_alpha, 0),
-                *model.features.pixel_values(met.features, pixel),
-                *model.features.tangents(met.features, d_features, pixel),
+                *model.features.pixel_values(met.features_at(pixel, model), pixel),
+                *model.features.tangents(met.features_at(pixel, model), d_features, pixel),
             ]
 
         def visit(state: tuple, visited: list[list[Float]]) -> tuple:
@@ -327,6 +329,11 @@ class _Crossing:
     features: list[Float]
     footprint: MicroTileFootprint
     alphas: list[Alpha]
+    depths: list[Float]  # of the peaks at the 16 pixels
+
+    def features_at(self, pixel: int, model: ImageModel) -> list[Float]:
+        """Return the stored features at a pixel."""
+        return model.features.at_depth(self.features, self.depths[pixel])
 
 
 @dataclass(frozen=True)
@@ -426,14 +433,16 @@ def _walk(
         keys = records.load_keys(entry, active)
         footprint = model.footprint(geometry, lanes, active)
         alphas = list(model.alphas(geometry, footprint))
-        met = _Crossing(place, entry, active, geometry, features, footprint, alphas)
+        alongs = order.depths.pixel_depths(footprint, keys)
+        depths = [keys[-1] * along for along in alongs]
+        met = _Crossing(place, entry, active, geometry, features, footprint, alphas, depths)
         # Depth of a missing splat: before all others, so that it is visited at once and changes
         # nothing; after the last splat, behind them, so that it replaces them in the window.
         absent = dr.select(active, t.Float(-dr.inf), dr.inf)
         next_queue, visited = [], []
-        for pixel, along in enumerate(order.depths.pixel_depths(footprint, keys)):
+        for pixel, (along, depth) in enumerate(zip(alongs, depths, strict=True)):
             alpha = dr.select(along > 0, alphas[pixel].value, 0)
-            depth = dr.select(alpha >= UNORDERED_ALPHA, keys[-1] * along, absent)
+            depth = dr.select(alpha >= UNORDERED_ALPHA, depth, absent)
             places, nearest = _insert(queue[pixel], [depth, alpha, *carry(met, pixel)])
             next_queue.append(places)
             visited.append(nearest[1:])
@@ -478,8 +487,8 @@ def _feature_gradient(
     inputs: _WalkInputs, met: _Crossing, pixel: int, g: list[list[Float]]
 ) -> Float | int:
     """Return c . g of a splat at a pixel; g: [plane][pixel] derivative of the loss."""
-    features = inputs.model.features
-    return features.feature_gradient(met.features, pixel, [plane[pixel] for plane in g])
+    stored = met.features_at(pixel, inputs.model)
+    return inputs.model.features.feature_gradient(stored, pixel, [plane[pixel] for plane in g])
 
 
 def _totals(
@@ -565,10 +574,13 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Float], g: list[list[Float]]) -
         footprint = model.footprint(geometry, lanes, True)
         own = first_place + place
         weights, d_log_alpha = (Rows((plane,), PIXELS).load(own) for plane in pairs)
+        keys = records.load_keys(entry, True)
+        alongs = inputs.order.depths.pixel_depths(footprint, keys)
         d_stored = [t.Float(0) for _ in features]
-        for pixel, weight in enumerate(weights):
+        for pixel, (weight, along) in enumerate(zip(weights, alongs, strict=True)):
             g_pixel = [plane[pixel] for plane in g]
-            d_stored = model.features.add_derivatives(d_stored, features, pixel, weight, g_pixel)
+            stored = model.features.at_depth(features, keys[-1] * along)
+            d_stored = model.features.add_derivatives(d_stored, stored, pixel, weight, g_pixel)
         moments = model.falloff.moments(footprint, d_log_alpha, model.positions)
         partials.store(moments + d_stored, own)
         return (place + 1,)

@@ -11,8 +11,9 @@ and each surface's own share is p_k times T_k, the transmittance in front of it:
     T_k = 1 - sum_{i: z_i <= z_k} w_i.
 
 So surfaces change no alpha and no transmittance: they scale features, and one more plane for each
-sums the weights in front. Which splats are in front is decided by the depths of their means, as
-their order is. Not differentiated: z, p, and that decision.
+sums the weights in front. Which splats are in front is decided by the depths by which they are
+ordered: those of their means, or of their peaks at each pixel. Not differentiated: z, p, and that
+decision.
 """
 
 from __future__ import annotations
@@ -84,6 +85,10 @@ class OccludedFeatures(SplatFeatures):
             features=self.features.bind(lanes, positions),
             bound=list(zip(*bound, strict=True)),
         )
+
+    @override
+    def at_depth(self, stored: list[Float], depth: Float) -> list[Float]:
+        return [*stored[:-1], depth]
 
     @override
     def pixel_values(self, stored: list[Float], pixel: int) -> list[Float]:

@@ -414,6 +414,11 @@ class SplatFeatures:
         del lanes, positions
         return self
 
+    def at_depth(self, stored: list[Float], depth: Float) -> list[Float]:
+        """Return the stored numbers of a splat that a pixel sees at a depth of its own."""
+        del depth
+        return stored
+
     def pixel_values(self, stored: list[Float], pixel: int) -> list[Float]:
         """Return the splat's features at a pixel."""
         del pixel
