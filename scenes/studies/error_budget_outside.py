@@ -241,11 +241,13 @@ def gaussians_of(
     }
 
 
-def around(distance: float, count: int = NUM_VIEWS, center: np.ndarray | float = 0.0) -> list[Pose]:
-    """Return views from a ring, from changing heights, towards its middle."""
+def around(
+    distance: float, center: np.ndarray | float = 0.0, heights: tuple[float, float] = (0.3, 0.5)
+) -> list[Pose]:
+    """Return views from a ring, from changing heights (mean, amplitude), towards its middle."""
     poses = []
-    for k in range(count):
-        angle, height = 2 * np.pi * k / count, 0.3 + 0.5 * np.sin(2.4 * k)
+    for k in range(NUM_VIEWS):
+        angle, height = 2 * np.pi * k / NUM_VIEWS, heights[0] + heights[1] * np.sin(2.4 * k)
         place = np.array([np.cos(angle), np.sin(angle), height])
         place *= distance / np.linalg.norm(place)
         forward = -place / distance
@@ -293,7 +295,7 @@ def kinds() -> dict[str, Kind]:
         "open shutter": Kind(plain, around(3.0), close=moving(0.05, 0.15)),
         "rolling shutter": Kind(plain, around(3.0), close=moving(0.05, 0.15), shutter="rolling"),
         "open aperture": Kind(plain, around(3.0), aperture=(0.05, 3.0)),
-        "surface and environment": Kind(plain, around(3.0), wall=-0.4),
+        "surface and environment": Kind(plain, around(3.0, heights=(0.9, 0.3)), wall=-0.4),
     }
 
 
