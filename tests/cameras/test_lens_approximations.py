@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import lenses
 from support.cases import reference_camera, with_lens
 from support.helpers import FLOAT64, device_gaussians, rows
 from support.lens_scenes import (
@@ -20,14 +21,13 @@ from support.lens_scenes import (
     points_at,
     splats_of,
 )
+from support.lenses import Orthographic
 from support.reference_lenses import gaussians_at, whitened_samples
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.accuracy.unscented import unscented_shape
 from drgs.config.approximations import Approximations
-from drgs.reference import lenses
 from drgs.reference import splatting as reference
-from drgs.reference.lenses import Orthographic
 from drgs.splatting import rendering
 
 

@@ -6,17 +6,17 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from support import lenses as reference
 from support.cases import with_lens
 from support.helpers import FLOAT32, FLOAT64, Case
 from support.kernels import kernels_of_a_frame
 from support.lens_scenes import FORMS, LENSES, kernel_lens, lens_camera
+from support.lenses import OpenCV, Pinhole
+from support.lenses import ThinPrismFisheye as ThinPrism
 
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
-from drgs.reference import lenses as reference
-from drgs.reference.lenses import OpenCV, Pinhole
-from drgs.reference.lenses import ThinPrismFisheye as ThinPrism
 
 # ----------------------------------------------------------------------------------------------
 # Missing coefficients

@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from support import lenses
 from support.cases import edges_behind, large_behind, reference_camera, with_lens
 from support.helpers import FLOAT32, FLOAT64, both_precisions, rows, single
 from support.lens_scenes import (
@@ -18,15 +19,14 @@ from support.lens_scenes import (
     points_at,
     splats_of,
 )
+from support.lenses import Fisheye, OpenCV, ThinPrismFisheye
 from support.reference_lenses import camera_at_origin, gaussians_at
 
 from drgs.cameras import distortion, fisheye
 from drgs.cameras.fisheye import Fisheye as CameraFisheye
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye as CameraThinPrismFisheye
-from drgs.reference import lenses
 from drgs.reference import splatting as reference
-from drgs.reference.lenses import Fisheye, OpenCV, ThinPrismFisheye
 
 # ----------------------------------------------------------------------------------------------
 # Visibility

@@ -8,7 +8,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support import reference_effects
+from support import lenses, reference_effects
 from support.cases import close_camera, reference_camera, shutter, with_lens
 from support.helpers import (
     FLOAT32,
@@ -31,7 +31,6 @@ from drgs.cameras.motion import (
 )
 from drgs.core.arrays import types_of
 from drgs.effects.compose import with_effects
-from drgs.reference import lenses
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 from drgs.testing import Case

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import REPOSITORY
-from support import small_capture
+from support import lenses, small_capture
 from support.commands import assert_ends_well
 from support.folders import visible
 from support.openexr import read_exr
@@ -36,7 +36,6 @@ from drgs.core.errors import UserNote
 from drgs.datasets import load_dataset
 from drgs.export import __main__ as export
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.reference import lenses
 from drgs.reference import splatting as reference
 from drgs.results.folder import VIEWS
 from drgs.results.refined_cameras import write_views

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import lenses as reference
 from support.analytic_shapes import box, images_of, opaque_at, sphere, together
 
 from drgs.cameras.viewpoints import CameraMotion
 from drgs.initialization.start_box import Box
 from drgs.initialization.visual_hull import are_masks, hull_points, silhouettes_of
-from drgs.reference import lenses as reference
 
 START_BOX = Box(np.zeros(3), 1.3)
 BALL = images_of(sphere(0.8), 16)

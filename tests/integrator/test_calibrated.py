@@ -29,10 +29,10 @@ from support.calibrated_sensors import (
     transform,
 )
 from support.lens_scenes import LENSES, points_at
+from support.lenses import OpenCV
 from support.views import VIEWS, gradients_of, image_of, pose, splats_before
 
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.reference.lenses import OpenCV
 
 MOVING = [replace(s, close=CLOSE) for s in (PINHOLE, OPENCV, FISHEYE)]
 ROLLING = [replace(s, shutter="rolling") for s in MOVING]

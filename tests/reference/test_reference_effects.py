@@ -12,20 +12,19 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from support import reference_effects
-from support.reference_effects import ThinLens
-from support.reference_lenses import FISHEYE, THIN_PRISM, camera_at_origin, gaussians_at
-from support.reference_scenes import BACKGROUND, assert_images_agree, rotation_about, small_scene
-
-from drgs.reference import lenses
-from drgs.reference import splatting as reference
-from drgs.reference.lenses import (
+from support import lenses, reference_effects
+from support.lenses import (
     Fisheye,
     OpenCV,
     Orthographic,
     Pinhole,
     ThinPrismFisheye,
 )
+from support.reference_effects import ThinLens
+from support.reference_lenses import FISHEYE, THIN_PRISM, camera_at_origin, gaussians_at
+from support.reference_scenes import BACKGROUND, assert_images_agree, rotation_about, small_scene
+
+from drgs.reference import splatting as reference
 from drgs.reference.splatting import Camera
 
 # ----------------------------------------------------------------------------------------------

@@ -9,12 +9,11 @@ import numpy as np
 
 from drgs.cameras.camera import Camera
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.reference import lenses
 from drgs.reference import splatting as reference
-from drgs.reference.lenses import Equirectangular, Fisheye, OpenCV, Pinhole, ThinPrismFisheye
-from support import reference_effects
+from support import lenses, reference_effects
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import LENSES, rolling_image
+from support.lenses import Equirectangular, Fisheye, OpenCV, Pinhole, ThinPrismFisheye
 from support.views import VIEWS, Scene, View, pose, splats_before
 
 WINDOW = (13, 7, 29, 18)

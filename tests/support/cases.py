@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from drgs.cameras.motion import MotionBlur, RollingShutter
 from drgs.core.arrays import types_of
-from drgs.reference import lenses, rays
+from drgs.reference import rays
 from drgs.reference import splatting as reference
 from drgs.testing import Case, Values, adjoint_is_transpose, bytes_are_reproducible, single
-from support import helpers, reference_effects
+from support import helpers, lenses, reference_effects
 from support.helpers import NEAR_THRESHOLD
 from support.lens_scenes import (
     FOCAL,

@@ -14,10 +14,9 @@ from drgs.cameras import equirectangular, fisheye, orthographic, thin_prism_fish
 from drgs.cameras import lens as camera_lens
 from drgs.cameras.camera import Camera
 from drgs.cameras.radial_tangential import RadialTangential
-from drgs.reference import lenses
 from drgs.reference import splatting as reference
-from drgs.reference.lenses import Equirectangular, Fisheye, OpenCV, Orthographic, ThinPrismFisheye
 from drgs.splatting.projection import ewa, load_rows, plain_opacity, project
+from support import lenses
 from support.helpers import (
     FLOAT32,
     FLOAT64,
@@ -28,6 +27,7 @@ from support.helpers import (
     rows,
     single,
 )
+from support.lenses import Equirectangular, Fisheye, OpenCV, Orthographic, ThinPrismFisheye
 from support.reference_lenses import FISHEYE, THIN_PRISM
 
 # ----------------------------------------------------------------------------------------------

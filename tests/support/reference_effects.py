@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from drgs.reference import lenses
 from drgs.reference import splatting as reference
-from drgs.reference.lenses import Lens, Pinhole, render
 from drgs.reference.splatting import Camera, Gaussians, Projection, RenderedImage
+from support import lenses
+from support.lenses import Lens, Pinhole, render
 
 PINHOLE = Pinhole()
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from drgs.reference.lenses import Fisheye, ThinPrismFisheye
 from drgs.reference.splatting import Camera, Gaussians
+from support.lenses import Fisheye, ThinPrismFisheye
 
 FISHEYE = Fisheye(-0.03125, 0.015625, -0.0078125, 0.001953125)
 
