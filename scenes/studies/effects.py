@@ -115,8 +115,16 @@ def rendering_cases() -> list[RenderingCase]:
     def lens(kind: str, coefficients: dict[str, float]) -> dict[str, object]:
         return calibrated | {"lens": kind, **coefficients}
 
+    exact = {"projection": "exact"}
+    sensors = {
+        "pinhole": {},
+        "distortion: k1 k2 p1 p2": lens("opencv", fox),
+        "fisheye: k1 k2": lens("fisheye", fisheye),
+        "rolling shutter": moving | {"shutter": "rolling"},
+    }
     return [
         RenderingCase("none", "none"),
+        *(RenderingCase("exact projection", name, s, exact) for name, s in sensors.items()),
         *(RenderingCase("view dependence", f"SH degree {k}", sh_degree=k) for k in range(3)),
         RenderingCase("background", "environment", scene={"sky": sky}),
         RenderingCase("background", "image", integrator={"background": behind}),
