@@ -70,12 +70,13 @@ class ShortFit:
     """A fit of few iterations to small photographs, some of which were held out."""
 
     config: FitConfig
-    dataset: Dataset  # ``test``: the held-out training photographs
+    dataset: Dataset  # ``test``: the held-out training photographs, of all folds
     gaussians: Gaussians  # numpy arrays
     images: Sequence[np.ndarray]  # (H, W, 3) display space: renderings of the held-out views
     alignments: Sequence[Alignment]  # of these
     factor: int  # px of the dataset's photographs in one of the fit's
     wall_s: float  # of its iterations
+    trained: Sequence[Alignment] = ()  # of the first fold's training views; without effects alone
 
     @property
     def psnr(self) -> np.ndarray:
@@ -157,7 +158,7 @@ class TrainingEffect(Protocol):
         return make() if section is None else make(section)
 
     @classmethod
-    def look_for(cls, fit: ShortFit) -> Finding | None:
+    def look_for(cls, fit: ShortFit) -> Finding | Sequence[Finding] | None:
         """Return what a short fit without the effect shows of it; None: nothing can be said.
 
         ``drgs examine`` tries what is likely, and chooses what is worth it.

@@ -63,7 +63,7 @@ class Photometry(CenteredEffect):
 
     def __init__(self, config: ColorConfig, views: Sequence[View]) -> None:
         """views: the training split."""
-        keys = [_camera_key(view) for view in views]
+        keys = [camera_key(view) for view in views]
         rows = {key: row for row, key in enumerate(dict.fromkeys(keys))}
         self.camera_rows = [rows[key] for key in keys]  # by view
         if config.response_lr is not None and len(rows) == 1:
@@ -145,7 +145,7 @@ def given_rates(config: ColorConfig) -> dict[str, float]:
     return {name: rate for name, rate in rates.items() if rate is not None}
 
 
-def _camera_key(view: View) -> tuple[object, ...]:
+def camera_key(view: View) -> tuple[object, ...]:
     """Return a key that is the same for photographs by the same camera."""
     size = view.width, view.height
     return *size, view.fx, view.fy, view.cx, view.cy, repr(view.lens)

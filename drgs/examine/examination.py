@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import repeat
 from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from pydantic import ValidationError
-from scipy.special import stdtrit
+from scipy.stats import wilcoxon
 from typing_extensions import override
 
 from drgs.cli.execution import select_variant
@@ -30,11 +32,12 @@ from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError, one_line
 from drgs.datasets.images import smaller_view, with_arrays
-from drgs.datasets.types import Dataset, evenly_spaced
+from drgs.datasets.types import Dataset, View, evenly_spaced
 from drgs.effects.base import Finding, Progress, ShortFit
+from drgs.effects.photometry import camera_key
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import Start, gaussians_at, start_of
-from drgs.results.alignment import align
+from drgs.results.alignment import Alignment, align
 from drgs.training.finite_checks import NonFiniteError
 from drgs.training.trainer import Trainer
 
@@ -45,12 +48,16 @@ SHARE_OF_ITERATIONS, MAX_ITERATIONS, MIN_ITERATIONS = 1 / 6, 500, 250
 than six times the least is not examined."""
 
 MAX_VIEWS, MIN_VIEWS = 160, 20  # photographs of an examination; with fewer there is none
-NUM_HELD_OUT, HELD_OUT_STRIDE = 10, (4, 8)
-"""Photographs that are left out, about: one in four to one in eight."""
+NUM_HELD_OUT, HELD_OUT_STRIDE, FEW_HELD_OUT = 10, (4, 8), 20
+"""Photographs that are left out, about: one in four to one in eight. Below 50 photographs, so many
+folds leave out others that there are 20: of 20 photographs, each is left out once."""
 
-MIN_GAIN_DB, CONFIDENCE = 0.05, 0.975
-"""A gain that counts: in itself, and the confidence that the mean over held-out photographs is
-above zero, by Student's t."""
+MIN_GAIN_DB, CONFIDENCE, TRIMMED = 0.05, 0.99, 0.1
+"""A gain that counts: in itself, and the confidence that gains of held-out photographs are above
+zero, by Wilcoxon's signed ranks without the share of them that is farthest from their middle.
+Leaving these out makes 0.97 of it, for normal gains."""
+
+MIN_CAMERA_VIEWS = 8  # held-out, of a camera whose gains alone may count
 
 WARM_UP_ITERATIONS = 20  # of a short fit, whose time does not count: kernels are compiled
 
@@ -64,8 +71,8 @@ class Decision:
 
     effect: str
     evidence: str
-    gain: float | None = None  # dB, mean over the held-out photographs; None: it was not tried
-    spread: float | None = None  # dB: standard error of this mean
+    gain: float | None = None  # dB, middle of held-out photographs; None: it was not tried
+    spread: float | None = None  # dB: standard error of this middle
     cost: float | None = None  # time of iterations, relative to those without the effect
     changes: Mapping[str, object]  # values of the configuration that simulate it, by key
     chosen: bool = False
@@ -144,11 +151,11 @@ def examine(
     if note := _reason_not_examined(config, dataset):
         return Examination((), 0, 0.0, note)
     given, short = given_keys(config), _shorten(resolve_defaults(config, dataset))
-    split, factor = split_views(dataset)
+    folds, factor = split_views(dataset)
     progress = progress or (lambda what, done, total: None)
     if mi.variant() is None:
         select_variant(VARIANTS[0])
-    base = short_fit(short, split, factor, partial(progress, "baseline"))
+    base = short_fits(short, folds, factor, partial(progress, "baseline"), with_trained=True)
     decisions = []
     for finding in _findings(base):
         if any(overlaps(key, other) for key in finding.changes for other in given):
@@ -158,7 +165,7 @@ def examine(
             continue
         try:
             changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
-            tried = short_fit(changed, split, factor, partial(progress, finding.effect))
+            tried = short_fits(changed, folds, factor, partial(progress, finding.effect))
         except (ValidationError, UserError, NonFiniteError) as error:
             decisions.append(_reject(finding, f"; could not be tried: {one_line(error, 100)}"))
             continue
@@ -167,13 +174,25 @@ def examine(
         if decision.chosen:  # the next one is tried beside it
             base = tried
     wall_s = time.perf_counter() - started
-    return Examination(tuple(decisions), len(split.test), wall_s)
+    return Examination(tuple(decisions), len(base.images), wall_s)
 
 
 def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
-    """Return the decision about an effect from two short fits: the second one simulates it."""
-    gains = fitted.psnr - without.psnr
-    gain, spread = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains)))
+    """Return the decision about an effect from two short fits: the second one simulates it.
+
+    The gain is the median of the mean gains of all pairs of held-out photographs, by ranks (Hodges
+    and Lehmann 1963), which a few that differ do not move, nor do they spread it. It counts where
+    it does over all photographs, or over those of one camera while others do not lose.
+    """
+    before = dict(zip(_names(without), without.psnr, strict=True))
+    views = [view for view in fitted.dataset.test if view.name in before]
+    after = dict(zip(_names(fitted), fitted.psnr, strict=True))
+    gains = np.array([after[view.name] - before[view.name] for view in views])
+    keys = [camera_key(view) for view in views]
+    cameras = [np.array([key == other for other in keys]) for key in dict.fromkeys(keys)]
+    cameras = [of_camera for of_camera in cameras if of_camera.sum() >= MIN_CAMERA_VIEWS]
+    gain, spread = middle_of(gains)
+    alone = any(_counts(gains[each], 1 - (1 - CONFIDENCE) / len(cameras)) for each in cameras)
     return Decision(
         effect=finding.effect,
         evidence=finding.evidence,
@@ -181,8 +200,34 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
         spread=spread,
         cost=fitted.wall_s / without.wall_s,
         changes=finding.changes,
-        chosen=gain > max(MIN_GAIN_DB, spread * float(stdtrit(len(gains) - 1, CONFIDENCE))),
+        chosen=_counts(gains, CONFIDENCE)
+        or (alone and all(middle_of(gains[each])[0] > -MIN_GAIN_DB for each in cameras)),
     )
+
+
+def _names(fit: ShortFit) -> list[str]:
+    return [view.name for view in fit.dataset.test]
+
+
+def middle_of(gains: np.ndarray) -> tuple[float, float]:
+    """Return Hodges and Lehmann's estimate of the gains' middle, and its standard error.
+
+    The error is that of the normal distribution which has its interval of ranks.
+    """
+    count = len(gains)
+    rows, columns = np.triu_indices(count)
+    means = np.sort((gains[rows] + gains[columns]) / 2)
+    off = np.sqrt(count * (count + 1) * (2 * count + 1) / 24)  # of the ranks' sum
+    ends = np.clip(len(means) / 2 + off * np.array([-1, 1]), 0, len(means) - 1).round().astype(int)
+    return float(np.median(means)), float(np.diff(means[ends])[0] / 2)
+
+
+def _counts(gains: np.ndarray, confidence: float) -> bool:
+    middle, _ = middle_of(gains)
+    order = np.argsort(np.abs(gains - middle), kind="stable")
+    kept = gains[order[: len(gains) - int(TRIMMED * len(gains))]]
+    is_sure = wilcoxon(kept, alternative="greater").pvalue <= 1 - confidence
+    return bool(middle > MIN_GAIN_DB and is_sure)
 
 
 def _reject(finding: Finding, reason: str = "") -> Decision:
@@ -207,23 +252,62 @@ def overlaps(key: str, other: str) -> bool:
 # Short fits
 
 
-def split_views(dataset: Dataset) -> tuple[Dataset, int]:
-    """Return the training photographs, small, with some left out as ``test``, and their divisor."""
+def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
+    """Return folds of the training photographs, small, and their divisor.
+
+    ``test`` of each fold are photographs that it leaves out; the first fold alone, unless
+    photographs are few.
+    """
     views = evenly_spaced(dataset.train, MAX_VIEWS)
     factor = max(1, round(max(view.width for view in views) / SHORT_FIT_WIDTH_PX))
     stride = int(np.clip(len(views) // NUM_HELD_OUT, *HELD_OUT_STRIDE))
     small = [with_arrays(smaller_view(view, factor)) for view in views]
-    held_out = range(stride // 2, len(small), stride)
-    train = tuple(view for index, view in enumerate(small) if index not in held_out)
-    test = [small[index] for index in held_out]
-    test = tuple(view for view in test if view.mask is None or np.any(view.mask))
-    return replace(dataset, train=train, test=test), factor
+    num_folds = 1
+    if stride == HELD_OUT_STRIDE[0]:
+        num_folds = min(stride, -(-FEW_HELD_OUT * stride // len(views)))
+    folds = []
+    for first in np.roll(np.arange(stride), -(stride // 2))[:num_folds]:
+        train = tuple(view for index, view in enumerate(small) if index % stride != first)
+        test = tuple(v for v in small[first::stride] if v.mask is None or np.any(v.mask))
+        folds.append(replace(dataset, train=train, test=test))
+    return folds, factor
 
 
-def short_fit(
-    config: FitConfig, split: Dataset, factor: int, progress: Callable[[int, int], None]
+def short_fits(
+    config: FitConfig,
+    folds: Sequence[Dataset],
+    factor: int,
+    progress: Callable[[int, int], None],
+    with_trained: bool = False,
 ) -> ShortFit:
-    """Fit the training views of ``split``, and render its test views; config: of a short fit."""
+    """Fit the training views of each fold, and render its test views; config: of a short fit.
+
+    Photographs that it leaves out are fitted in no fold, and rendered where ``with_trained``.
+    """
+    fits = []
+    for number, fold in enumerate(folds):
+        total = config.iterations * len(folds)
+        done = number * config.iterations
+        shown = lambda k, _, done=done: progress(done + k, total)  # noqa: E731
+        fits.append(_short_fit(config, fold, factor, shown, with_trained and number == 0))
+    first, join = fits[0], lambda name: [each for fit in fits for each in getattr(fit, name)]
+    tests = tuple(view for fit in fits for view in fit.dataset.test)
+    return replace(
+        first,
+        dataset=replace(first.dataset, test=tests),
+        images=join("images"),
+        alignments=join("alignments"),
+        wall_s=sum(fit.wall_s for fit in fits),
+    )
+
+
+def _short_fit(
+    config: FitConfig,
+    split: Dataset,
+    factor: int,
+    progress: Callable[[int, int], None],
+    with_trained: bool,
+) -> ShortFit:
     split = with_background(split, config)
     config = resolve_defaults(config, split)
     trainer = Trainer(config, split, gaussians_at(_fewer(start_of(config, split)), config))
@@ -237,11 +321,21 @@ def short_fit(
     trainer.check()  # waits for the device
     wall_s = time.perf_counter() - started
     images = [np.asarray(image)[..., :3] for image in trainer.images(split.test)]
-    pairs = zip(split.test, images, strict=True)
-    alignments = [align(view, image, split.background) for view, image in pairs]
+    alignments = _align(split.test, images, split.background)
+    trained = ()
+    if with_trained:
+        seen = (np.asarray(image)[..., :3] for image in trainer.images(split.train))
+        trained = _align(split.train, seen, split.background)
     gaussians = trainer.gaussians()
     trainer.release()
-    return ShortFit(config, split, gaussians, images, alignments, factor, wall_s)
+    return ShortFit(config, split, gaussians, images, alignments, factor, wall_s, trained)
+
+
+def _align(
+    views: Sequence[View], images: Iterable[np.ndarray], background: tuple[float, float, float]
+) -> list[Alignment]:
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(align, views, images, repeat(background)))
 
 
 def _fewer(start: Start) -> Start:
@@ -279,7 +373,8 @@ def _findings(fit: ShortFit) -> list[Finding]:
     """Return the findings of what is shipped and of installed extensions."""
     effects = sorted((extension.value for extension in EFFECTS.all()), key=lambda e: e.order)
     found = [look(fit) for look in (_look_for_background, *(e.look_for for e in effects))]
-    return [finding for finding in found if finding is not None]
+    lists = ([each] if isinstance(each, Finding) else each or () for each in found)
+    return [finding for findings in lists for finding in findings]
 
 
 def _look_for_background(fit: ShortFit) -> Finding | None:
