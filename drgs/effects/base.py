@@ -77,6 +77,7 @@ class ShortFit:
     factor: int  # px of the dataset's photographs in one of the fit's
     wall_s: float  # of its iterations
     trained: Sequence[Alignment] = ()  # of the first fold's training views; without effects alone
+    trained_images: Sequence[np.ndarray] = ()  # (H, W, 3) display space, of these
 
     @property
     def psnr(self) -> np.ndarray:
@@ -93,6 +94,7 @@ class Finding:
     is_likely: bool  # whether it is worth a short fit with the effect
     changes: Mapping[str, object]  # values of the configuration that simulate it, by key
     in_short_fits: Mapping[str, object] = field(default_factory=dict)  # further ones, such as rates
+    advice: str = ""  # what to do where it is not chosen; in place of changes, if no fit has any
 
 
 Progress = Callable[[str, int, int], None]  # what is tried, iterations done, and of how many
@@ -116,8 +118,8 @@ class ChosenEffects(Protocol):
         ...
 
 
-Examiner = Callable[["Dataset", "FitConfig", Progress | None], ChosenEffects]
-"""Chooses effects for a dataset and a configuration, whose own values stay."""
+Examiner = Callable[["Dataset", "FitConfig", Progress | None, float | None], ChosenEffects]
+"""Chooses effects for a dataset and a configuration, whose own values stay, within some seconds."""
 
 
 class TrainingEffect(Protocol):

@@ -26,13 +26,14 @@ from drgs.config.extensions import EFFECTS
 from drgs.core.errors import UserError
 from drgs.core.files import write_json
 from drgs.core.types import Float, TensorXf
-from drgs.effects.base import SimulatedEffect, as_tensor, entries, opacity_of
+from drgs.effects.base import Finding, ShortFit, SimulatedEffect, as_tensor, entries, opacity_of
 from drgs.effects.colors import ColorConfig
 from drgs.effects.optimised import CenteredEffect
 
 if TYPE_CHECKING:
     from drgs.config.schema import FitConfig
     from drgs.datasets.types import Dataset, View
+    from drgs.results.alignment import Alignment
     from drgs.training.views import FitState, TrainingView
 
 DARKEST = 1e-3  # of colours that f maps; below, and above 1, it is linear
@@ -40,6 +41,12 @@ DARKEST = 1e-3  # of colours that f maps; below, and above 1, it is linear
 PHOTOMETRY = "photometry.json"  # vignetting and response of the training views' cameras
 
 COEFFICIENTS = {"vignetting": 3, "response": 2}
+
+EXAMINED_LRS = {"vignetting": 0.03, "response": 0.005}  # where an examination chooses them
+
+MIN_CORNERS, MIN_EXPONENTS, MIN_CAMERA_VIEWS = 0.02, 0.03, 5
+"""Differences of photographs from renderings, which have absorbed most, from which a short fit is
+worth its time; and the fewest views of a camera that show them."""
 
 
 @EFFECTS.register("photometry")
@@ -55,6 +62,34 @@ class Photometry(CenteredEffect):
     def summarize(cls, config: FitConfig, dataset: Dataset) -> list[SimulatedEffect]:
         names = given_rates(config.section("colors", ColorConfig))
         return [SimulatedEffect(n, "of each camera", f"colors.{n}_lr") for n in names]
+
+    @classmethod
+    @override
+    def look_for(cls, fit: ShortFit) -> list[Finding]:
+        """Measure how photographs' corners and tones differ, by the middle of each camera's."""
+        views = (*fit.dataset.test, *fit.dataset.train)
+        alignments = (*fit.alignments, *fit.trained)
+        cameras: dict[tuple[object, ...], list[Alignment]] = {}
+        for view, alignment in zip(views, alignments, strict=False):
+            cameras.setdefault(camera_key(view), []).append(alignment)
+        several = [each for each in cameras.values() if len(each) >= MIN_CAMERA_VIEWS]
+        corners = [float(np.median([one.vignetting for one in each])) for each in several]
+        tones = [float(np.median([one.response for one in each])) for each in several]
+        darkest = max(corners, key=abs, default=0.0)
+        found = [
+            Finding(
+                "vignetting",
+                f"corners differ by {darkest:+.1%} where renderings have absorbed the rest",
+                is_likely=darkest < -MIN_CORNERS,
+                changes={"colors.vignetting_lr": EXAMINED_LRS["vignetting"]},
+            )
+        ]
+        if len(several) > 1:
+            spread = float(np.ptp(tones))
+            changes = {"colors.response_lr": EXAMINED_LRS["response"]}
+            text = f"exponents of {len(several)} cameras differ by {spread:.1%}"
+            found.append(Finding("response", text, spread > MIN_EXPONENTS, changes))
+        return found
 
     @classmethod
     @override

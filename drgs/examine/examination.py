@@ -10,14 +10,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import repeat
 from typing import cast
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from pydantic import ValidationError
@@ -25,32 +22,30 @@ from scipy.stats import wilcoxon
 from typing_extensions import override
 
 from drgs.cli.execution import select_variant
-from drgs.config.changes import given_keys, with_changes, with_iterations
+from drgs.config.changes import given_keys, with_changes
 from drgs.config.extensions import EFFECTS, EXAMINERS
 from drgs.config.load import config_from
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError, one_line
-from drgs.datasets.images import smaller_view, with_arrays
-from drgs.datasets.types import Dataset, View, evenly_spaced
+from drgs.datasets.types import Dataset
 from drgs.effects.base import Finding, Progress, ShortFit
 from drgs.effects.photometry import camera_key
+from drgs.examine.photographs import look_for_bad_photographs
+from drgs.examine.short_fits import (
+    MIN_ITERATIONS,
+    SHARE_OF_ITERATIONS,
+    Clock,
+    OutOfTimeError,
+    plan_short_fits,
+    short_fits,
+    shorten,
+    split_views,
+)
 from drgs.initialization.defaults import resolve_defaults
-from drgs.initialization.start import Start, gaussians_at, start_of
-from drgs.results.alignment import Alignment, align
 from drgs.training.finite_checks import NonFiniteError
-from drgs.training.trainer import Trainer
 
-SHORT_FIT_WIDTH_PX = 135  # about: of photographs in short fits
-NUM_GAUSSIANS = 15_000
-SHARE_OF_ITERATIONS, MAX_ITERATIONS, MIN_ITERATIONS = 1 / 6, 500, 250
-"""A short fit has this share of the fit's iterations, within these bounds; a fit that is shorter
-than six times the least is not examined."""
-
-MAX_VIEWS, MIN_VIEWS = 160, 20  # photographs of an examination; with fewer there is none
-NUM_HELD_OUT, HELD_OUT_STRIDE, FEW_HELD_OUT = 10, (4, 8), 20
-"""Photographs that are left out, about: one in four to one in eight. Below 50 photographs, so many
-folds leave out others that there are 20: of 20 photographs, each is left out once."""
+MIN_VIEWS = 20  # photographs of an examination; with fewer there is none
 
 MIN_GAIN_DB, CONFIDENCE, TRIMMED = 0.05, 0.99, 0.1
 """A gain that counts: in itself, and the confidence that gains of held-out photographs are above
@@ -58,8 +53,6 @@ zero, by Wilcoxon's signed ranks without the share of them that is farthest from
 Leaving these out makes 0.97 of it, for normal gains."""
 
 MIN_CAMERA_VIEWS = 8  # held-out, of a camera whose gains alone may count
-
-WARM_UP_ITERATIONS = 20  # of a short fit, whose time does not count: kernels are compiled
 
 BORDER_PX, BORDER_TOLERANCE, MIN_BORDER_SHARE = 2, 0.04, 0.6
 """A background of one colour: of each photograph's border, this share has it, but for this."""
@@ -75,6 +68,7 @@ class Decision:
     spread: float | None = None  # dB: standard error of this middle
     cost: float | None = None  # time of iterations, relative to those without the effect
     changes: Mapping[str, object]  # values of the configuration that simulate it, by key
+    advice: str = ""  # where they are not chosen, or there are none
     chosen: bool = False
 
 
@@ -86,6 +80,13 @@ class Examination:
     num_held_out: int  # training photographs
     wall_s: float
     note: str = ""  # why nothing was examined, if so
+    smaller: str = ""  # what there was no time for
+
+    @property
+    def bad_photographs(self) -> list[str]:
+        """Names of photographs that should be left out, chosen or not."""
+        tried = (each.changes for each in self.decisions if each.gain is not None)
+        return [name for changes in tried for name in _left_out(changes)]
 
     @property
     def changes(self) -> dict[str, object]:
@@ -117,15 +118,16 @@ class Examination:
             if one.gain is not None and one.cost is not None:
                 gain, cost = f"{one.gain:+.2f} ± {one.spread:.2f}", f"x {one.cost:.2f}"
             keys = ", ".join(f"{key}: {value}" for key, value in one.changes.items())
-            rows.append((one.effect, one.evidence, gain, cost, keys if one.chosen else "no"))
+            no = one.advice or "no"
+            rows.append((one.effect, one.evidence, gain, cost, keys if one.chosen else no))
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = (
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
             for row in rows
         )
-        return "\n  ".join(
-            [f"examined in {self.wall_s:.0f} s, on {self.num_held_out} held-out views:", *lines]
-        )
+        title = f"examined in {self.wall_s:.0f} s, on {self.num_held_out} held-out views"
+        title += f" (within --budget: {self.smaller}):" if self.smaller else ":"
+        return "\n  ".join([title, *lines])
 
 
 @EXAMINERS.register("short_fits")
@@ -133,48 +135,76 @@ def examine(
     dataset: Dataset,
     config: FitConfig | Mapping[str, object] | None = None,
     progress: Progress | None = None,
+    seconds: float | None = None,
 ) -> Examination:
     """Return which effects the dataset's training photographs need, with the evidence.
 
     config: of the fit, or nested mappings, by default all defaults; effects whose keys it gives are
     not examined. With a fit that is too short, or fewer than 20 training photographs, nothing is
-    examined, and ``note`` says so. Activates the Mitsuba variant ``llvm_ad_rgb`` where none is
-    active.
+    examined, and ``note`` says so. seconds: that the examination may take, which is smaller then,
+    or none. Activates the Mitsuba variant ``llvm_ad_rgb`` where none is active.
 
     Effects look for themselves: ``drgs.effects.base.TrainingEffect.look_for``.
     """
-    started = time.perf_counter()
+    clock = Clock(time.perf_counter(), seconds)
     if not isinstance(config, FitConfig):
         values = dict(config or {})
         values["data"] = {"path": ".", **cast("Mapping[str, object]", values.get("data", {}))}
         config = config_from(values, "examine(): config")
     if note := _reason_not_examined(config, dataset):
         return Examination((), 0, 0.0, note)
-    given, short = given_keys(config), _shorten(resolve_defaults(config, dataset))
+    given, short = given_keys(config), shorten(resolve_defaults(config, dataset))
     folds, factor = split_views(dataset)
     progress = progress or (lambda what, done, total: None)
     if mi.variant() is None:
         select_variant(VARIANTS[0])
-    base = short_fits(short, folds, factor, partial(progress, "baseline"), with_trained=True)
+    try:
+        short, folds, smaller = plan_short_fits(short, folds, clock)
+        base = short_fits(short, folds, factor, partial(progress, "baseline"), clock, True)
+    except OutOfTimeError:
+        note = f"short fits take longer than the {seconds:.0f} s that --budget leaves for them"
+        return Examination((), 0, clock.passed, note)
     decisions = []
     for finding in _findings(base):
         if any(overlaps(key, other) for key in finding.changes for other in given):
             continue
-        if not finding.is_likely:
-            decisions.append(_reject(finding))
-            continue
-        try:
-            changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
-            tried = short_fits(changed, folds, factor, partial(progress, finding.effect))
-        except (ValidationError, UserError, NonFiniteError) as error:
-            decisions.append(_reject(finding, f"; could not be tried: {one_line(error, 100)}"))
-            continue
-        decision = decide(finding, base, tried)
+        decision, base = _try(finding, base, folds, partial(progress, finding.effect), clock)
         decisions.append(decision)
-        if decision.chosen:  # the next one is tried beside it
-            base = tried
-    wall_s = time.perf_counter() - started
-    return Examination(tuple(decisions), len(base.images), wall_s)
+    return Examination(
+        tuple(decisions), sum(len(fold.test) for fold in folds), clock.passed, smaller=smaller
+    )
+
+
+def _try(
+    finding: Finding,
+    base: ShortFit,
+    folds: Sequence[Dataset],
+    progress: Callable[[int, int], None],
+    clock: Clock,
+) -> tuple[Decision, ShortFit]:
+    """Return the decision about a finding, and the fit beside which the next one is tried."""
+    if not finding.is_likely:
+        return _reject(finding), base
+    try:
+        if clock.left < base.wall_s:
+            raise OutOfTimeError
+        changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
+        tried = short_fits(changed, folds, base.factor, progress, clock)
+    except OutOfTimeError:
+        return _reject(finding, "; no time was left to try it"), base
+    except (ValidationError, UserError, NonFiniteError) as error:
+        return _reject(finding, f"; could not be tried: {one_line(error, 100)}"), base
+    if _left_out(finding.changes):
+        confirmed = look_for_bad_photographs(tried, _left_out(finding.changes))
+        if confirmed is None:
+            return _reject(finding, "; not confirmed by a fit without them"), base
+        finding = confirmed
+    decision = decide(finding, base, tried)
+    return decision, tried if decision.chosen else base
+
+
+def _left_out(changes: Mapping[str, object]) -> list[str]:
+    return cast("list[str]", changes.get("data.leave_out", []))
 
 
 def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
@@ -186,6 +216,7 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
     """
     before = dict(zip(_names(without), without.psnr, strict=True))
     views = [view for view in fitted.dataset.test if view.name in before]
+    views = [view for view in views if view.name not in fitted.config.data.leave_out]
     after = dict(zip(_names(fitted), fitted.psnr, strict=True))
     gains = np.array([after[view.name] - before[view.name] for view in views])
     keys = [camera_key(view) for view in views]
@@ -200,6 +231,7 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
         spread=spread,
         cost=fitted.wall_s / without.wall_s,
         changes=finding.changes,
+        advice=finding.advice,
         chosen=_counts(gains, CONFIDENCE)
         or (alone and all(middle_of(gains[each])[0] > -MIN_GAIN_DB for each in cameras)),
     )
@@ -232,7 +264,8 @@ def _counts(gains: np.ndarray, confidence: float) -> bool:
 
 def _reject(finding: Finding, reason: str = "") -> Decision:
     evidence = finding.evidence + reason
-    return Decision(effect=finding.effect, evidence=evidence, changes=finding.changes)
+    effect, changes, advice = finding.effect, finding.changes, finding.advice
+    return Decision(effect=effect, evidence=evidence, changes=changes, advice=advice)
 
 
 def _reason_not_examined(config: FitConfig, dataset: Dataset) -> str:
@@ -249,130 +282,14 @@ def overlaps(key: str, other: str) -> bool:
     return f"{key}.".startswith(f"{other}.") or f"{other}.".startswith(f"{key}.")
 
 
-# Short fits
-
-
-def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
-    """Return folds of the training photographs, small, and their divisor.
-
-    ``test`` of each fold are photographs that it leaves out; the first fold alone, unless
-    photographs are few.
-    """
-    views = evenly_spaced(dataset.train, MAX_VIEWS)
-    factor = max(1, round(max(view.width for view in views) / SHORT_FIT_WIDTH_PX))
-    stride = int(np.clip(len(views) // NUM_HELD_OUT, *HELD_OUT_STRIDE))
-    small = [with_arrays(smaller_view(view, factor)) for view in views]
-    num_folds = 1
-    if stride == HELD_OUT_STRIDE[0]:
-        num_folds = min(stride, -(-FEW_HELD_OUT * stride // len(views)))
-    folds = []
-    for first in np.roll(np.arange(stride), -(stride // 2))[:num_folds]:
-        train = tuple(view for index, view in enumerate(small) if index % stride != first)
-        test = tuple(v for v in small[first::stride] if v.mask is None or np.any(v.mask))
-        folds.append(replace(dataset, train=train, test=test))
-    return folds, factor
-
-
-def short_fits(
-    config: FitConfig,
-    folds: Sequence[Dataset],
-    factor: int,
-    progress: Callable[[int, int], None],
-    with_trained: bool = False,
-) -> ShortFit:
-    """Fit the training views of each fold, and render its test views; config: of a short fit.
-
-    Photographs that it leaves out are fitted in no fold, and rendered where ``with_trained``.
-    """
-    fits = []
-    for number, fold in enumerate(folds):
-        total = config.iterations * len(folds)
-        done = number * config.iterations
-        shown = lambda k, _, done=done: progress(done + k, total)  # noqa: E731
-        fits.append(_short_fit(config, fold, factor, shown, with_trained and number == 0))
-    first, join = fits[0], lambda name: [each for fit in fits for each in getattr(fit, name)]
-    tests = tuple(view for fit in fits for view in fit.dataset.test)
-    return replace(
-        first,
-        dataset=replace(first.dataset, test=tests),
-        images=join("images"),
-        alignments=join("alignments"),
-        wall_s=sum(fit.wall_s for fit in fits),
-    )
-
-
-def _short_fit(
-    config: FitConfig,
-    split: Dataset,
-    factor: int,
-    progress: Callable[[int, int], None],
-    with_trained: bool,
-) -> ShortFit:
-    split = with_background(split, config)
-    config = resolve_defaults(config, split)
-    trainer = Trainer(config, split, gaussians_at(_fewer(start_of(config, split)), config))
-    started = time.perf_counter()
-    while trainer.iteration < config.iterations:
-        trainer.step()
-        progress(trainer.iteration, config.iterations)
-        if trainer.iteration == WARM_UP_ITERATIONS:
-            dr.sync_thread()
-            started = time.perf_counter()
-    trainer.check()  # waits for the device
-    wall_s = time.perf_counter() - started
-    images = [np.asarray(image)[..., :3] for image in trainer.images(split.test)]
-    alignments = _align(split.test, images, split.background)
-    trained = ()
-    if with_trained:
-        seen = (np.asarray(image)[..., :3] for image in trainer.images(split.train))
-        trained = _align(split.train, seen, split.background)
-    gaussians = trainer.gaussians()
-    trainer.release()
-    return ShortFit(config, split, gaussians, images, alignments, factor, wall_s, trained)
-
-
-def _align(
-    views: Sequence[View], images: Iterable[np.ndarray], background: tuple[float, float, float]
-) -> list[Alignment]:
-    with ThreadPoolExecutor() as pool:
-        return list(pool.map(align, views, images, repeat(background)))
-
-
-def _fewer(start: Start) -> Start:
-    """Return at most as many points as a short fit has Gaussians."""
-    every = -(-len(start.means) // NUM_GAUSSIANS)
-    colors = None if start.colors is None else start.colors[::every]
-    return replace(start, means=start.means[::every], colors=colors)
-
-
-def _shorten(config: FitConfig) -> FitConfig:
-    iterations = min(MAX_ITERATIONS, round(SHARE_OF_ITERATIONS * config.iterations))
-    goal = getattr(config.densify.settings, "gaussians", None) or NUM_GAUSSIANS
-    changes = {
-        "densify.strategy": "budget",
-        "densify.budget.gaussians": min(goal, NUM_GAUSSIANS),
-        "densify.prune.to": None,
-        "init.num_points": None,
-        "coarse": None,
-        "optimizer.views_per_step": 1,
-    }
-    return with_changes(with_iterations(config, iterations), changes)
-
-
-def with_background(dataset: Dataset, config: FitConfig) -> Dataset:
-    """Return the dataset with the configured background behind opaque photographs."""
-    if any(view.alpha is not None for view in dataset.train) or config.data.background is None:
-        return dataset
-    return replace(dataset, background=config.data.background_rgb)
-
-
 # Findings
 
 
 def _findings(fit: ShortFit) -> list[Finding]:
     """Return the findings of what is shipped and of installed extensions."""
     effects = sorted((extension.value for extension in EFFECTS.all()), key=lambda e: e.order)
-    found = [look(fit) for look in (_look_for_background, *(e.look_for for e in effects))]
+    looks = _look_for_background, look_for_bad_photographs, *(e.look_for for e in effects)
+    found = [look(fit) for look in looks]
     lists = ([each] if isinstance(each, Finding) else each or () for each in found)
     return [finding for findings in lists for finding in findings]
 

@@ -45,6 +45,7 @@ class Alignment:
     zoom: float  # px at half the diagonal
     distortion: float  # px at half the diagonal, beyond the zoom
     skew: np.ndarray  # (2,) px at half the diagonal: shift of lower rows
+    sharpness: float  # logarithm of the photograph's steps between pixels over the rendering's
     left: np.ndarray  # (H, W) float32: RMS difference of each pixel that remains, masked ones 0
 
 
@@ -96,6 +97,7 @@ def align(
         zoom=float(moved[2] + others[3]),
         distortion=float(others[4]),
         skew=others[5:],
+        sharpness=float(np.log(_mean_step(photograph, seen) / _mean_step(at, seen))),
         left=(np.sqrt(np.square(left).mean(axis=2)) * seen).astype(np.float32),
     )
 
@@ -104,6 +106,16 @@ def _mean_error(difference: np.ndarray, counts: np.ndarray) -> float:
     """Return the mean square of differences (H, W, 3); counts: weights (H, W)."""
     squares = np.square(difference).mean(axis=2)
     return float((squares * counts).sum() / max(counts.sum(), 1e-10))
+
+
+def _mean_step(image: np.ndarray, counts: np.ndarray) -> float:
+    """Return the mean absolute difference of neighbouring pixels (H, W, 3) that count."""
+    steps = [np.diff(image, axis=axis) for axis in (0, 1)]
+    both = [np.minimum(counts[1:], counts[:-1]), np.minimum(counts[:, 1:], counts[:, :-1])]
+    sums = [
+        (np.abs(step).mean(axis=2) * each).sum() for step, each in zip(steps, both, strict=True)
+    ]
+    return float(sum(sums) / max(counts.sum(), 1) + MIN_DEVIATION)
 
 
 def _coordinates(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

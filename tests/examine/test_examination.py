@@ -32,7 +32,8 @@ from drgs.examine.examination import (
 )
 
 ITERATIONS = 1500  # of a fit: the fewest that are examined
-NAMES = ["background of one colour", "exposure and white balance", "camera refinement"]
+NAMES = ["background of one colour", "bad photographs", "exposure and white balance"]
+NAMES += ["vignetting", "camera refinement"]
 assert_examines = partial(assert_ends_well, command.main)
 
 
@@ -84,7 +85,7 @@ def test_what_photographs_call_for_is_chosen_and_nothing_else(dataset, case):
     found = drgs.examine(spoil(dataset, change), config_of())
     assert found.changes == chosen, str(found)
     assert [each.effect for each in found.decisions] == NAMES
-    assert found.num_held_out == 10
+    assert found.num_held_out == 20
     again = drgs.examine(spoil(dataset, change), config_of())
     for one, other in zip(found.decisions, again.decisions, strict=True):
         assert replace(one, cost=None) == replace(other, cost=None)
@@ -211,8 +212,10 @@ def fits_with_gains(gains, cameras=None):
     views = tuple(replace(v, fx=v.fx + number) for v, number in zip(views, cameras, strict=True))
     before = np.linspace(20, 30, len(gains))
     dataset = SimpleNamespace(test=views)
+    config = SimpleNamespace(data=SimpleNamespace(leave_out=[]))
     without = SimpleNamespace(dataset=dataset, psnr=before, wall_s=2.0)
-    return without, SimpleNamespace(dataset=dataset, psnr=before + gains, wall_s=3.0)
+    psnr = before + gains
+    return without, SimpleNamespace(config=config, dataset=dataset, psnr=psnr, wall_s=3.0)
 
 
 FINDING = Finding("x", "seen", True, {"colors.lr": 0.02})
@@ -322,7 +325,7 @@ def test_a_fit_of_a_folder_chooses_says_why_and_asks_once(folder):
     points = [(f / "point_cloud.ply").read_bytes() for f in (out, folder / "again")]
     assert points[0] == points[1]
     printed = assert_examines(data, *SETTINGS).stdout
-    assert re.search(r"examined in \d+ s, on 10 held-out views:", printed)
+    assert re.search(r"examined in \d+ s, on 20 held-out views:", printed)
     assert re.search(rf"fit with it: drgs fit {data} .* --set colors\.lr=0\.02\n", printed)
     message = "already holds another run, "
     other = (*SETTINGS, "--set", "colors.lr=0.05")
