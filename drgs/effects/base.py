@@ -95,6 +95,9 @@ class Finding:
     changes: Mapping[str, object]  # values of the configuration that simulate it, by key
     in_short_fits: Mapping[str, object] = field(default_factory=dict)  # further ones, such as rates
     advice: str = ""  # what to do where it is not chosen; in place of changes, if no fit has any
+    confirm: Callable[[ShortFit], Finding | None] | None = None
+    """Returns the finding with the evidence of the fit that has the effect; None: it has none."""
+    max_loss: float | None = None  # dB, of what is confirmed; None: it is chosen by its gain
 
 
 Progress = Callable[[str, int, int], None]  # what is tried, iterations done, and of how many

@@ -39,6 +39,8 @@ CAMERAS = "cameras.json"  # refined cameras of the training views
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
 MIN_SHIFT_PX = 0.35  # RMS, of photographs in a short fit; without wrong poses: 0.04 to 0.25
+MIN_CORNERS_PX = {"zoom": 0.25, "distortion": 0.6}  # of short fits' corners; without: 0.1, 0.35
+MIN_SKEW_PX = 0.2  # the same, between the middle and corners; without: 0.02 to 0.09
 SHORT_FIT_RATE = 1e-3  # of poses, which a short fit moves fewer times
 
 MAX_FOCAL_FACTOR = 1000  # up or down
@@ -143,20 +145,38 @@ class CameraRefinement(OptimisedEffect):
 
     @classmethod
     @override
-    def look_for(cls, fit: ShortFit) -> Finding | None:
-        """Measure by how much held-out photographs are shifted against their renderings."""
-        if fit.config.model.sh_direction != "mean":
-            return None
+    def look_for(cls, fit: ShortFit) -> list[Finding]:
+        """Measure by how much photographs are moved and distorted against their renderings."""
+        views = (*fit.alignments, *fit.trained)
+        zoom, bend = (float(np.median([getattr(v, n) for v in views])) for n in MIN_CORNERS_PX)
+        skew = float(np.median([abs(v.skew[0]) for v in views]))
         shifts = np.stack([alignment.shift for alignment in fit.alignments])
         root_mean_square = float(np.sqrt(np.square(shifts).sum(axis=1).mean()))
-        rate = SHORT_FIT_RATE
-        return Finding(
-            "camera refinement",
-            f"photographs are shifted by {root_mean_square * fit.factor:.1f} px",
-            is_likely=root_mean_square > MIN_SHIFT_PX,
-            changes={"cameras.optimise": True},
-            in_short_fits={"cameras.rotation_lr": rate, "cameras.translation_lr": rate},
-        )
+        rates = {"cameras.rotation_lr": SHORT_FIT_RATE, "cameras.translation_lr": SHORT_FIT_RATE}
+        poses, focal = {"cameras.optimise": True}, {"cameras.focal_lr": SHORT_FIT_RATE}
+        found = [
+            Finding(
+                "camera refinement",
+                f"photographs are shifted by {root_mean_square * fit.factor:.1f} px",
+                root_mean_square > MIN_SHIFT_PX,
+                poses,
+                rates,
+            ),
+            Finding(
+                "focal length",
+                f"renderings' corners are {zoom * fit.factor:+.1f} px farther out",
+                abs(zoom) > MIN_CORNERS_PX["zoom"],
+                poses | focal,
+                rates,
+            ),
+        ]
+        found = found if fit.config.model.sh_direction == "mean" else []
+        text = f"corners are bent by {bend * fit.factor:+.1f} px"
+        advice = "calibrate the lens" if abs(bend) > MIN_CORNERS_PX["distortion"] else ""
+        found.append(Finding("distortion", text, False, {}, advice=advice))
+        text = f"rows are sheared by {skew * fit.factor:.1f} px"
+        advice = "rolling shutter, with both poses" if skew > MIN_SKEW_PX else ""
+        return [*found, Finding("rolling shutter", text, False, {}, advice=advice)]
 
     def __init__(self, config: CamerasConfig, num_views: int, extent: float) -> None:
         """num_views: of the training split; extent: world units."""

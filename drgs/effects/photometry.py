@@ -14,6 +14,7 @@ camera has none. The background behind a transparent photograph is unchanged.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,7 +34,6 @@ from drgs.effects.optimised import CenteredEffect
 if TYPE_CHECKING:
     from drgs.config.schema import FitConfig
     from drgs.datasets.types import Dataset, View
-    from drgs.results.alignment import Alignment
     from drgs.training.views import FitState, TrainingView
 
 DARKEST = 1e-3  # of colours that f maps; below, and above 1, it is linear
@@ -43,10 +43,17 @@ PHOTOMETRY = "photometry.json"  # vignetting and response of the training views'
 COEFFICIENTS = {"vignetting": 3, "response": 2}
 
 EXAMINED_LRS = {"vignetting": 0.03, "response": 0.005}  # where an examination chooses them
+SHORT_FIT_LR, MAX_LOSS_DB = 0.003, 0.5  # in short fits, in which they have no time to settle
 
-MIN_CORNERS, MIN_EXPONENTS, MIN_CAMERA_VIEWS = 0.02, 0.03, 5
-"""Differences of photographs from renderings, which have absorbed most, from which a short fit is
-worth its time; and the fewest views of a camera that show them."""
+EVIDENCE = {
+    "vignetting": ("corners are darker by {:.1%}", (0.004, 0.06)),
+    "response": ("exponents of cameras differ by {:.1%}", (0.02, 0.04)),
+}
+"""Differences of photographs from renderings, which absorb most of them, from which a short fit is
+worth its time; and those of its renderings, which have absorbed less, from which it confirms them.
+"""
+
+MIN_CAMERA_VIEWS = 5  # that show them
 
 
 @EFFECTS.register("photometry")
@@ -66,30 +73,11 @@ class Photometry(CenteredEffect):
     @classmethod
     @override
     def look_for(cls, fit: ShortFit) -> list[Finding]:
-        """Measure how photographs' corners and tones differ, by the middle of each camera's."""
-        views = (*fit.dataset.test, *fit.dataset.train)
-        alignments = (*fit.alignments, *fit.trained)
-        cameras: dict[tuple[object, ...], list[Alignment]] = {}
-        for view, alignment in zip(views, alignments, strict=False):
-            cameras.setdefault(camera_key(view), []).append(alignment)
-        several = [each for each in cameras.values() if len(each) >= MIN_CAMERA_VIEWS]
-        corners = [float(np.median([one.vignetting for one in each])) for each in several]
-        tones = [float(np.median([one.response for one in each])) for each in several]
-        darkest = max(corners, key=abs, default=0.0)
-        found = [
-            Finding(
-                "vignetting",
-                f"corners differ by {darkest:+.1%} where renderings have absorbed the rest",
-                is_likely=darkest < -MIN_CORNERS,
-                changes={"colors.vignetting_lr": EXAMINED_LRS["vignetting"]},
-            )
-        ]
-        if len(several) > 1:
-            spread = float(np.ptp(tones))
-            changes = {"colors.response_lr": EXAMINED_LRS["response"]}
-            text = f"exponents of {len(several)} cameras differ by {spread:.1%}"
-            found.append(Finding("response", text, spread > MIN_EXPONENTS, changes))
-        return found
+        """Measure how photographs' corners and tones differ, by the middle of each camera's.
+
+        Splats absorb most of it. What they have absorbed shows when a fit has coefficients.
+        """
+        return [found for name in COEFFICIENTS if (found := _finding(name, 0, fit))]
 
     @classmethod
     @override
@@ -184,3 +172,30 @@ def camera_key(view: View) -> tuple[object, ...]:
     """Return a key that is the same for photographs by the same camera."""
     size = view.width, view.height
     return *size, view.fx, view.fy, view.cx, view.cy, repr(view.lens)
+
+
+def _finding(name: str, stage: int, fit: ShortFit) -> Finding | None:
+    """Return what the middle of each camera's views shows; None: nothing, or too little at stage 1.
+
+    stage: 0 without the effect, 1 with it.
+    """
+    views, alignments = (*fit.dataset.test, *fit.dataset.train), (*fit.alignments, *fit.trained)
+    cameras: dict[tuple[object, ...], list[float]] = {}
+    for view, alignment in zip(views, alignments, strict=False):
+        cameras.setdefault(camera_key(view), []).append(getattr(alignment, name))
+    middles = [np.median(each) for each in cameras.values() if len(each) >= MIN_CAMERA_VIEWS]
+    if len(middles) < (1 if name == "vignetting" else 2):
+        return None
+    value = float(-np.min(middles) if name == "vignetting" else np.ptp(middles))
+    text, least = EVIDENCE[name]
+    if stage and value < least[stage]:
+        return None
+    return Finding(
+        name,
+        text.format(value),
+        is_likely=value > least[stage],
+        changes={f"colors.{name}_lr": EXAMINED_LRS[name]},
+        in_short_fits={f"colors.{name}_lr": SHORT_FIT_LR},
+        confirm=partial(_finding, name, 1),
+        max_loss=MAX_LOSS_DB,
+    )

@@ -31,7 +31,7 @@ from drgs.core.errors import UserError, one_line
 from drgs.datasets.types import Dataset
 from drgs.effects.base import Finding, Progress, ShortFit
 from drgs.effects.photometry import camera_key
-from drgs.examine.photographs import look_for_bad_photographs
+from drgs.examine.photographs import look_for_bad_photographs, look_for_moving_things
 from drgs.examine.short_fits import (
     MIN_ITERATIONS,
     SHARE_OF_ITERATIONS,
@@ -194,12 +194,10 @@ def _try(
         return _reject(finding, "; no time was left to try it"), base
     except (ValidationError, UserError, NonFiniteError) as error:
         return _reject(finding, f"; could not be tried: {one_line(error, 100)}"), base
-    if _left_out(finding.changes):
-        confirmed = look_for_bad_photographs(tried, _left_out(finding.changes))
-        if confirmed is None:
-            return _reject(finding, "; not confirmed by a fit without them"), base
-        finding = confirmed
-    decision = decide(finding, base, tried)
+    confirmed = finding if finding.confirm is None else finding.confirm(tried)
+    if confirmed is None:
+        return _reject(finding, "; a fit with it does not confirm it"), base
+    decision = decide(confirmed, base, tried)
     return decision, tried if decision.chosen else base
 
 
@@ -223,7 +221,12 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
     cameras = [np.array([key == other for other in keys]) for key in dict.fromkeys(keys)]
     cameras = [of_camera for of_camera in cameras if of_camera.sum() >= MIN_CAMERA_VIEWS]
     gain, spread = middle_of(gains)
-    alone = any(_counts(gains[each], 1 - (1 - CONFIDENCE) / len(cameras)) for each in cameras)
+    if finding.max_loss is not None:
+        chosen = gain > -finding.max_loss
+    else:
+        alone = any(_counts(gains[each], 1 - (1 - CONFIDENCE) / len(cameras)) for each in cameras)
+        agree = all(middle_of(gains[each])[0] > -MIN_GAIN_DB for each in cameras)
+        chosen = _counts(gains, CONFIDENCE) or (alone and agree)
     return Decision(
         effect=finding.effect,
         evidence=finding.evidence,
@@ -232,8 +235,7 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
         cost=fitted.wall_s / without.wall_s,
         changes=finding.changes,
         advice=finding.advice,
-        chosen=_counts(gains, CONFIDENCE)
-        or (alone and all(middle_of(gains[each])[0] > -MIN_GAIN_DB for each in cameras)),
+        chosen=chosen,
     )
 
 
@@ -288,8 +290,9 @@ def overlaps(key: str, other: str) -> bool:
 def _findings(fit: ShortFit) -> list[Finding]:
     """Return the findings of what is shipped and of installed extensions."""
     effects = sorted((extension.value for extension in EFFECTS.all()), key=lambda e: e.order)
-    looks = _look_for_background, look_for_bad_photographs, *(e.look_for for e in effects)
-    found = [look(fit) for look in looks]
+    found = [_look_for_background(fit), look_for_bad_photographs(fit)]
+    found += [effect.look_for(fit) for effect in effects]
+    found.append(look_for_moving_things(fit))
     lists = ([each] if isinstance(each, Finding) else each or () for each in found)
     return [finding for findings in lists for finding in findings]
 

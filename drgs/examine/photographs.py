@@ -8,6 +8,7 @@ move.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from functools import partial
 
 import numpy as np
 from scipy import ndimage
@@ -33,9 +34,11 @@ LEAST_DEVIATIONS = {"psnr": 0.8, "sharpness": 0.06}
 FULL, MIN_FULL_SHARE, MIN_BRIGHTER = 0.985, 0.1, 0.15
 """Overexposed: the brightness of full pixels, their share beyond others', and the gain."""
 
-COVERED_DEVIATIONS, COVERED_SHARES = 4.0, (0.02, 0.7)
+COVERED_DEVIATIONS, COVERED_SHARES = 6.0, (0.015, 0.7)
 """Something before the camera: pixels that differ by so many times the median of all photographs,
-and the share of the largest connected region of them."""
+and the share of the largest connected region of them, which is 0.002 to 0.009 in clean ones."""
+
+MANY = 0.3  # of the photographs, with such regions: things move
 
 ELSEWHERE = "of another place, or its pose is wrong"
 
@@ -64,7 +67,19 @@ def look_for_bad_photographs(fit: ShortFit, among: Collection[str] | None = None
         is_likely=is_likely,
         changes={"data.leave_out": [*found]},
         advice=words if among is not None else "",
+        confirm=partial(look_for_bad_photographs, among=[*found]),
     )
+
+
+def look_for_moving_things(fit: ShortFit) -> Finding:
+    """Return whether many photographs have a region that no other one agrees with."""
+    alignments = [*fit.alignments, *fit.trained]
+    typical = _typical_difference(alignments)
+    regions = np.array([_largest_region(one, typical) for one in alignments])
+    share = float((regions > COVERED_SHARES[0]).mean())
+    advice = "masks (mask_path); reflections that are not simulated look the same"
+    text = f"{share:.0%} of photographs have a region that is in no other"
+    return Finding("things that move", text, False, {}, advice=advice if share > MANY else "")
 
 
 def bad_photographs(fit: ShortFit) -> dict[str, str]:
@@ -91,7 +106,7 @@ def _outliers(
     softer = -_deviations([a.sharpness for a in alignments], LEAST_DEVIATIONS["sharpness"])
     full = np.array([(np.asarray(v.image).min(axis=2) > FULL).mean() for v in views])
     full -= [(image.min(axis=2) > FULL).mean() for image in images]
-    typical = np.median([np.median(a.left[a.left > 0]) for a in alignments if a.left.any()])
+    typical = _typical_difference(alignments)
     found = {}
     for index, (view, one) in enumerate(zip(views, alignments, strict=True)):
         is_bright = one.gains.mean() > MIN_BRIGHTER
@@ -118,12 +133,22 @@ def _why_worse(
     best = max(alike, key=alike.__getitem__)
     if alike[best] > max(MIN_SIMILARITY, alike[view.name] + MIN_ADVANTAGE):
         return f"swapped (resembles the view of {best})"
-    differs = ndimage.uniform_filter(alignment.left, 3) > COVERED_DEVIATIONS * typical
-    regions, count = ndimage.label(differs)
-    share = max(np.bincount(regions.ravel())[1:], default=0) / differs.size if count else 0.0
+    share = _largest_region(alignment, typical)
     if COVERED_SHARES[0] < share < COVERED_SHARES[1] and alike[view.name] > MIN_SIMILARITY:
         return f"something before the camera ({share:.0%} of it)"
     return ELSEWHERE
+
+
+def _typical_difference(alignments: Sequence[Alignment]) -> float:
+    medians = [np.median(one.left[one.left > 0]) for one in alignments if one.left.any()]
+    return float(np.median(medians or [1.0]))
+
+
+def _largest_region(alignment: Alignment, typical: float) -> float:
+    """Return the share of the largest connected region of pixels that differ."""
+    differs = ndimage.uniform_filter(alignment.left, 3) > COVERED_DEVIATIONS * typical
+    regions, _ = ndimage.label(differs)
+    return float(max(np.bincount(regions.ravel())[1:], default=0) / differs.size)
 
 
 def _thumbnail(image: np.ndarray) -> np.ndarray:

@@ -76,18 +76,18 @@ def align(
         numbers = _fit_numbers(directions, blurred - smooth, counts)
         gains, moved = numbers[:3], moved + numbers[3:]
     at, is_covered = _move(image, moved)
-    seen, left = counts * is_covered, photograph - at - gains * (at - behind)
-    error, others = _mean_error(left, seen), np.zeros(7)
-    if is_covered.mean() < MIN_COVERED or not error < before:
-        gains, moved = np.zeros(3), np.zeros(4)
-        seen, left, error = counts, photograph - image, before
-    elif min(height, width) >= MIN_SIDE_PX:
+    seen, left, others = counts * is_covered, photograph - at - gains * (at - behind), np.zeros(7)
+    error = _mean_error(left, seen)
+    if min(height, width) >= MIN_SIDE_PX:
         base = (1 + gains) * (at - behind)
         smooth = ndimage.gaussian_filter(left, blur)
         others = _fit_numbers(_other_directions(base, at, blur), smooth, seen)
         further = left - _other_directions(base, at, (0, 0, 0))[..., :3] @ others[:3]
         if (after := _mean_error(further, seen)) < error:
             left, error = further, after
+    if is_covered.mean() < MIN_COVERED or not error < before:
+        gains, moved, others = np.zeros(3), np.zeros(4), np.zeros(7)
+        at, seen, left, error = image, counts, photograph - image, before
     return Alignment(
         gains=gains,
         shift=moved[:2],

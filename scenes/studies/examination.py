@@ -23,7 +23,7 @@ from pathlib import Path
 
 import drgs
 import numpy as np
-from clean_sets import KINDS, clean_set
+from clean_sets import KINDS, ROOM, clean_set
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.changes import with_changes
 from drgs.config.load import config_from
@@ -258,8 +258,11 @@ MIXES: tuple[tuple[int, tuple[tuple[Spoil, float], ...]], ...] = (
 def load(folder: Path) -> tuple[FitConfig, Dataset]:
     """Return configuration and dataset of ``drgs fit FOLDER``, or of a clean set."""
     if folder.name in CLEAN:
-        config = config_from({"data": {"path": "."}, "iterations": CLEAN_ITERATIONS}, "study")
         kind, _, seed = folder.name.partition("@")
+        values = {"data": {"path": "."}, "iterations": CLEAN_ITERATIONS}
+        if kind == "panoramas":
+            values["init"] = {"half_extent": ROOM}
+        config = config_from(values, "study")
         return config, clean_set(kind.replace("_", " "), int(seed or 0))
     config, _ = config_for(folder)
     return config, drgs.load_dataset(config.data_for_training)
