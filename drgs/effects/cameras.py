@@ -39,8 +39,8 @@ CAMERAS = "cameras.json"  # refined cameras of the training views
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
 MIN_SHIFT_PX = 0.35  # RMS, of photographs in a short fit; without wrong poses: 0.04 to 0.25
-MIN_CORNERS_PX = {"zoom": 0.25, "distortion": 0.6}  # of short fits' corners; without: 0.1, 0.35
-MIN_SKEW_PX = 0.2  # the same, between the middle and corners; without: 0.02 to 0.09
+MIN_ZOOM_PX, MIN_BEND_PX, MIN_SKEW_PX = 0.25, 0.5, 0.35
+"""The same, at corners: middles of all photographs, without: 0.1, 0.35, 0.02 to 0.25."""
 SHORT_FIT_RATE = 1e-3  # of poses, which a short fit moves fewer times
 
 MAX_FOCAL_FACTOR = 1000  # up or down
@@ -148,35 +148,25 @@ class CameraRefinement(OptimisedEffect):
     def look_for(cls, fit: ShortFit) -> list[Finding]:
         """Measure by how much photographs are moved and distorted against their renderings."""
         views = (*fit.alignments, *fit.trained)
-        zoom, bend = (float(np.median([getattr(v, n) for v in views])) for n in MIN_CORNERS_PX)
+        zoom, bend = (_middle([getattr(v, name) for v in views]) for name in ("zoom", "distortion"))
         skew = float(np.median([abs(v.skew[0]) for v in views]))
         shifts = np.stack([alignment.shift for alignment in fit.alignments])
-        root_mean_square = float(np.sqrt(np.square(shifts).sum(axis=1).mean()))
+        shift = float(np.sqrt(np.square(shifts).sum(axis=1).mean()))
         rates = {"cameras.rotation_lr": SHORT_FIT_RATE, "cameras.translation_lr": SHORT_FIT_RATE}
         poses, focal = {"cameras.optimise": True}, {"cameras.focal_lr": SHORT_FIT_RATE}
+        moved = f"photographs are shifted by {shift * fit.factor:.1f} px"
+        larger = f"renderings' corners are {zoom * fit.factor:.1f} px farther out"
+        bent = f"corners are bent by {bend * fit.factor:.1f} px"
+        sheared = f"rows are sheared by {skew * fit.factor:.1f} px"
+        calibrate = "calibrate the lens" if abs(bend) > MIN_BEND_PX else ""
+        both = "two poses and shutter: rolling, if it is a video" if skew > MIN_SKEW_PX else ""
         found = [
-            Finding(
-                "camera refinement",
-                f"photographs are shifted by {root_mean_square * fit.factor:.1f} px",
-                root_mean_square > MIN_SHIFT_PX,
-                poses,
-                rates,
-            ),
-            Finding(
-                "focal length",
-                f"renderings' corners are {zoom * fit.factor:+.1f} px farther out",
-                abs(zoom) > MIN_CORNERS_PX["zoom"],
-                poses | focal,
-                rates,
-            ),
+            Finding("camera refinement", moved, shift > MIN_SHIFT_PX, poses, rates),
+            Finding("focal length", larger, abs(zoom) > MIN_ZOOM_PX, poses | focal, rates),
         ]
         found = found if fit.config.model.sh_direction == "mean" else []
-        text = f"corners are bent by {bend * fit.factor:+.1f} px"
-        advice = "calibrate the lens" if abs(bend) > MIN_CORNERS_PX["distortion"] else ""
-        found.append(Finding("distortion", text, False, {}, advice=advice))
-        text = f"rows are sheared by {skew * fit.factor:.1f} px"
-        advice = "rolling shutter, with both poses" if skew > MIN_SKEW_PX else ""
-        return [*found, Finding("rolling shutter", text, False, {}, advice=advice)]
+        found.append(Finding("distortion", bent, False, {}, advice=calibrate))
+        return [*found, Finding("rolling shutter", sheared, False, {}, advice=both)]
 
     def __init__(self, config: CamerasConfig, num_views: int, extent: float) -> None:
         """num_views: of the training split; extent: world units."""
@@ -309,6 +299,12 @@ class CameraRefinement(OptimisedEffect):
         cameras = cameras_json(self.refined_views(dataset.train), dataset.origin)
         content = {"lens_change": asdict(self.lens_change), **cameras}
         write_json(folder / CAMERAS, content)
+
+
+def _middle(values: Sequence[float]) -> float:
+    """Return the median; 0 where the median deviation from it is larger, since none is seen."""
+    middle = float(np.median(values))
+    return middle if abs(middle) > 1.4826 * np.median(np.abs(np.array(values) - middle)) else 0.0
 
 
 def _set_sensor(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:

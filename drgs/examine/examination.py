@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import cast
 
@@ -118,8 +118,8 @@ class Examination:
             if one.gain is not None and one.cost is not None:
                 gain, cost = f"{one.gain:+.2f} ± {one.spread:.2f}", f"x {one.cost:.2f}"
             keys = ", ".join(f"{key}: {value}" for key, value in one.changes.items())
-            no = one.advice or "no"
-            rows.append((one.effect, one.evidence, gain, cost, keys if one.chosen else no))
+            last = keys if one.chosen else one.advice or "no"
+            rows.append((one.effect, one.evidence, gain, cost, last))
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = (
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -170,9 +170,8 @@ def examine(
             continue
         decision, base = _try(finding, base, folds, partial(progress, finding.effect), clock)
         decisions.append(decision)
-    return Examination(
-        tuple(decisions), sum(len(fold.test) for fold in folds), clock.passed, smaller=smaller
-    )
+    num_held_out = sum(len(fold.test) for fold in folds)
+    return Examination(tuple(decisions), num_held_out, clock.passed, smaller=smaller)
 
 
 def _try(
@@ -212,10 +211,12 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
     and Lehmann 1963), which a few that differ do not move, nor do they spread it. It counts where
     it does over all photographs, or over those of one camera while others do not lose.
     """
-    before = dict(zip(_names(without), without.psnr, strict=True))
-    views = [view for view in fitted.dataset.test if view.name in before]
-    views = [view for view in views if view.name not in fitted.config.data.leave_out]
-    after = dict(zip(_names(fitted), fitted.psnr, strict=True))
+    before, after = (
+        {view.name: psnr for view, psnr in zip(fit.dataset.test, fit.psnr, strict=True)}
+        for fit in (without, fitted)
+    )
+    kept = before.keys() - {*fitted.config.data.leave_out}
+    views = [view for view in fitted.dataset.test if view.name in kept]
     gains = np.array([after[view.name] - before[view.name] for view in views])
     keys = [camera_key(view) for view in views]
     cameras = [np.array([key == other for other in keys]) for key in dict.fromkeys(keys)]
@@ -227,20 +228,8 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
         alone = any(_counts(gains[each], 1 - (1 - CONFIDENCE) / len(cameras)) for each in cameras)
         agree = all(middle_of(gains[each])[0] > -MIN_GAIN_DB for each in cameras)
         chosen = _counts(gains, CONFIDENCE) or (alone and agree)
-    return Decision(
-        effect=finding.effect,
-        evidence=finding.evidence,
-        gain=gain,
-        spread=spread,
-        cost=fitted.wall_s / without.wall_s,
-        changes=finding.changes,
-        advice=finding.advice,
-        chosen=chosen,
-    )
-
-
-def _names(fit: ShortFit) -> list[str]:
-    return [view.name for view in fit.dataset.test]
+    cost = fitted.wall_s / without.wall_s
+    return replace(_reject(finding), gain=gain, spread=spread, cost=cost, chosen=chosen)
 
 
 def middle_of(gains: np.ndarray) -> tuple[float, float]:
@@ -265,9 +254,10 @@ def _counts(gains: np.ndarray, confidence: float) -> bool:
 
 
 def _reject(finding: Finding, reason: str = "") -> Decision:
-    evidence = finding.evidence + reason
-    effect, changes, advice = finding.effect, finding.changes, finding.advice
-    return Decision(effect=effect, evidence=evidence, changes=changes, advice=advice)
+    effect, evidence = finding.effect, finding.evidence + reason
+    return Decision(
+        effect=effect, evidence=evidence, changes=finding.changes, advice=finding.advice
+    )
 
 
 def _reason_not_examined(config: FitConfig, dataset: Dataset) -> str:
@@ -287,14 +277,13 @@ def overlaps(key: str, other: str) -> bool:
 # Findings
 
 
-def _findings(fit: ShortFit) -> list[Finding]:
-    """Return the findings of what is shipped and of installed extensions."""
+def _findings(fit: ShortFit) -> Iterator[Finding]:
+    """Yield the findings of what is shipped and of installed extensions."""
     effects = sorted((extension.value for extension in EFFECTS.all()), key=lambda e: e.order)
-    found = [_look_for_background(fit), look_for_bad_photographs(fit)]
-    found += [effect.look_for(fit) for effect in effects]
-    found.append(look_for_moving_things(fit))
-    lists = ([each] if isinstance(each, Finding) else each or () for each in found)
-    return [finding for findings in lists for finding in findings]
+    looks = [_look_for_background, look_for_bad_photographs, *(e.look_for for e in effects)]
+    for look in (*looks, look_for_moving_things):
+        found = look(fit)
+        yield from [found] if isinstance(found, Finding) else found or ()
 
 
 def _look_for_background(fit: ShortFit) -> Finding | None:

@@ -20,10 +20,7 @@ from drgs.results.alignment import Alignment
 MIN_VIEWS = 8  # that are compared with one another
 NORMAL = 1.4826  # standard deviation over the median absolute one, of a normal distribution
 
-MAX_SHOWN, MAX_SHARE = (
-    4,
-    0.15,
-)  # photographs in the table; of all, beyond which they are no single ones
+MAX_SHOWN, MAX_SHARE = 4, 0.15  # photographs in the table; of all, or they are no single ones
 
 MAX_DEVIATIONS = 5.0
 """Of the middle, in normal deviations: photographs that differ by more are bad."""
@@ -84,15 +81,15 @@ def look_for_moving_things(fit: ShortFit) -> Finding:
 
 def bad_photographs(fit: ShortFit) -> dict[str, str]:
     """Return the reasons by name; photographs of both groups, fitted and held out, are judged."""
-    views, images = (*fit.dataset.test, *fit.dataset.train), [*fit.images, *fit.trained_images]
-    named = {view.name: image for view, image in zip(views, images, strict=False)}
-    found: dict[str, str] = {}
-    for part, alignments, seen in (
-        (fit.dataset.test, fit.alignments, fit.images),
-        (fit.dataset.train, fit.trained, fit.trained_images),
-    ):
-        if len(alignments) >= MIN_VIEWS:
-            found |= _outliers(part, alignments, seen, named)
+    held_out = fit.dataset.test, fit.alignments, fit.images
+    trained = fit.dataset.train[: len(fit.trained)], fit.trained, fit.trained_images
+    pairs = (
+        pair for views, _, images in (held_out, trained) for pair in zip(views, images, strict=True)
+    )
+    renderings, found = {view.name: image for view, image in pairs}, {}
+    for views, alignments, images in (held_out, trained):
+        if len(views) >= MIN_VIEWS:
+            found |= _outliers(views, alignments, images, renderings)
     return found
 
 
