@@ -40,7 +40,8 @@ INTRINSICS = ("fx", "fy", "cx", "cy")
 
 MIN_SHIFT_PX = 0.35  # RMS, of photographs in a short fit; without wrong poses: 0.04 to 0.25
 MIN_ZOOM_PX, MIN_BEND_PX, MIN_SKEW_PX = 0.25, 0.5, 0.35
-"""The same, at corners: middles of all photographs, without: 0.1, 0.35, 0.02 to 0.25."""
+"""The same, at corners: middles of all photographs, without: 0.1, 0.35, 0.05 to 0.3."""
+MIN_DEVIATIONS = 1.3  # of such a middle from 0; without texture: 1.2
 SHORT_FIT_RATE = 1e-3  # of poses, which a short fit moves fewer times
 
 MAX_FOCAL_FACTOR = 1000  # up or down
@@ -149,7 +150,7 @@ class CameraRefinement(OptimisedEffect):
         """Measure by how much photographs are moved and distorted against their renderings."""
         views = (*fit.alignments, *fit.trained)
         zoom, bend = (_middle([getattr(v, name) for v in views]) for name in ("zoom", "distortion"))
-        skew = float(np.median([abs(v.skew[0]) for v in views]))
+        skew, other = np.median([np.abs(v.skew) for v in views], axis=0)
         shifts = np.stack([alignment.shift for alignment in fit.alignments])
         shift = float(np.sqrt(np.square(shifts).sum(axis=1).mean()))
         rates = {"cameras.rotation_lr": SHORT_FIT_RATE, "cameras.translation_lr": SHORT_FIT_RATE}
@@ -159,7 +160,8 @@ class CameraRefinement(OptimisedEffect):
         bent = f"corners are bent by {bend * fit.factor:.1f} px"
         sheared = f"rows are sheared by {skew * fit.factor:.1f} px"
         calibrate = "calibrate the lens" if abs(bend) > MIN_BEND_PX else ""
-        both = "two poses and shutter: rolling, if it is a video" if skew > MIN_SKEW_PX else ""
+        is_rolling = skew > max(MIN_SKEW_PX, 1.5 * other)
+        both = "two poses and shutter: rolling, if it is a video" if is_rolling else ""
         found = [
             Finding("camera refinement", moved, shift > MIN_SHIFT_PX, poses, rates),
             Finding("focal length", larger, abs(zoom) > MIN_ZOOM_PX, poses | focal, rates),
@@ -302,9 +304,10 @@ class CameraRefinement(OptimisedEffect):
 
 
 def _middle(values: Sequence[float]) -> float:
-    """Return the median; 0 where the median deviation from it is larger, since none is seen."""
+    """Return the median; 0 unless it is far from 0 for the normal deviation of a single value."""
     middle = float(np.median(values))
-    return middle if abs(middle) > 1.4826 * np.median(np.abs(np.array(values) - middle)) else 0.0
+    deviation = 1.4826 * np.median(np.abs(np.array(values) - middle))
+    return middle if abs(middle) > MIN_DEVIATIONS * deviation else 0.0
 
 
 def _set_sensor(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:

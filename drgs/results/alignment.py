@@ -29,6 +29,7 @@ SIGMA_PX = 1.0  # of the blur before the derivatives, so that they hold for shif
 NUM_MOVES, NUM_REWEIGHTINGS = 4, 4
 MIN_SIDE_PX = 8  # of an image; smaller ones are not aligned
 MIN_COVERED = 0.5  # share of the image; a rendering that is moved farther is not aligned
+MAX_MOVE = 0.25  # of corners, half diagonals: farther ones are found where nothing is alike
 MIN_DEVIATION = 1e-6  # of the remaining differences, display space
 DARKEST = 0.02  # of colours whose logarithm is taken
 
@@ -76,7 +77,7 @@ def align(
         numbers = _fit_numbers(directions, blurred - smooth, counts)
         gains, moved = numbers[:3], moved + numbers[3:]
     at, is_covered = _move(image, moved)
-    seen, left, others = counts * is_covered, photograph - at - gains * (at - behind), np.zeros(7)
+    seen, left, others = counts * is_covered, photograph - at - gains * (at - behind), np.zeros(8)
     error = _mean_error(left, seen)
     if min(height, width) >= MIN_SIDE_PX:
         base = (1 + gains) * (at - behind)
@@ -85,8 +86,9 @@ def align(
         further = left - _other_directions(base, at, (0, 0, 0))[..., :3] @ others[:3]
         if (after := _mean_error(further, seen)) < error:
             left, error = further, after
-    if is_covered.mean() < MIN_COVERED or not error < before:
-        gains, moved, others = np.zeros(3), np.zeros(4), np.zeros(7)
+    farthest = max(np.abs(moved).max(), np.abs(others[3:]).max()) / (np.hypot(width, height) / 2)
+    if is_covered.mean() < MIN_COVERED or farthest > MAX_MOVE or not error < before:
+        gains, moved, others = np.zeros(3), np.zeros(4), np.zeros(8)
         at, seen, left, error = image, counts, photograph - image, before
     return Alignment(
         gains=gains,
@@ -96,7 +98,7 @@ def align(
         response=float(others[2]),
         zoom=float(moved[2] + others[3]),
         distortion=float(others[4]),
-        skew=others[5:],
+        skew=others[5:7],
         sharpness=float(np.log(_mean_step(photograph, seen) / _mean_step(at, seen))),
         left=(np.sqrt(np.square(left).mean(axis=2)) * seen).astype(np.float32),
     )
@@ -157,13 +159,18 @@ def _directions(image: np.ndarray, base: np.ndarray) -> np.ndarray:
 def _other_directions(
     base: np.ndarray, image: np.ndarray, blur: tuple[float, float, float]
 ) -> np.ndarray:
-    """Return derivatives (H, W, 3, 7): gain, vignetting, response, zoom, distortion, two skews."""
+    """Return derivatives (H, W, 3, 8).
+
+    They are along gain, vignetting, response, zoom, distortion, two skews, and a rotation, which
+    has explained a part of the skews.
+    """
     x, y = (each[..., None] for each in _coordinates(*base.shape[:2]))
     s, tones = x * x + y * y, np.log(np.clip(image, DARKEST, 1))
     gains = [ndimage.gaussian_filter(base * each, blur) for each in (np.ones_like(s), s, tones)]
     dy, dx = np.gradient(ndimage.gaussian_filter(image, blur), axis=(0, 1))
     outward = x * dx + y * dy
-    return np.stack([*gains, outward, s * outward, y * dx, y * dy], axis=-1)
+    numbers = [*gains, outward, s * outward, y * dx, y * dy, x * dy - y * dx]
+    return np.stack(numbers, axis=-1)
 
 
 def _fit_numbers(directions: np.ndarray, difference: np.ndarray, counts: np.ndarray) -> np.ndarray:
