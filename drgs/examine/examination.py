@@ -9,6 +9,7 @@ photographs are not looked at.
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -35,8 +36,8 @@ from drgs.examine.photographs import look_for_bad_photographs, look_for_moving_t
 from drgs.examine.short_fits import (
     MIN_ITERATIONS,
     SHARE_OF_ITERATIONS,
-    Clock,
     OutOfTimeError,
+    check_time,
     plan_short_fits,
     short_fits,
     shorten,
@@ -146,7 +147,8 @@ def examine(
 
     Effects look for themselves: ``drgs.effects.base.TrainingEffect.look_for``.
     """
-    clock = Clock(time.perf_counter(), seconds)
+    started = time.perf_counter()
+    end = math.inf if seconds is None else started + seconds
     if not isinstance(config, FitConfig):
         values = dict(config or {})
         values["data"] = {"path": ".", **cast("Mapping[str, object]", values.get("data", {}))}
@@ -159,19 +161,20 @@ def examine(
     if mi.variant() is None:
         select_variant(VARIANTS[0])
     try:
-        short, folds, smaller = plan_short_fits(short, folds, clock)
-        base = short_fits(short, folds, factor, partial(progress, "baseline"), clock, True)
+        short, folds, smaller = plan_short_fits(short, folds, end)
+        base = short_fits(short, folds, factor, partial(progress, "baseline"), end, True)
     except OutOfTimeError:
         note = f"short fits take longer than the {seconds:.0f} s that --budget leaves for them"
-        return Examination((), 0, clock.passed, note)
+        return Examination((), 0, time.perf_counter() - started, note)
     decisions = []
     for finding in _findings(base):
         if any(overlaps(key, other) for key in finding.changes for other in given):
             continue
-        decision, base = _try(finding, base, folds, partial(progress, finding.effect), clock)
+        decision, base = _try(finding, base, folds, partial(progress, finding.effect), end)
         decisions.append(decision)
     num_held_out = sum(len(fold.test) for fold in folds)
-    return Examination(tuple(decisions), num_held_out, clock.passed, smaller=smaller)
+    wall_s = time.perf_counter() - started
+    return Examination(tuple(decisions), num_held_out, wall_s, smaller=smaller)
 
 
 def _try(
@@ -179,16 +182,15 @@ def _try(
     base: ShortFit,
     folds: Sequence[Dataset],
     progress: Callable[[int, int], None],
-    clock: Clock,
+    end: float,
 ) -> tuple[Decision, ShortFit]:
     """Return the decision about a finding, and the fit beside which the next one is tried."""
     if not finding.is_likely:
         return _reject(finding), base
     try:
-        if clock.left < base.wall_s:
-            raise OutOfTimeError
+        check_time(end - base.wall_s)
         changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
-        tried = short_fits(changed, folds, base.factor, progress, clock)
+        tried = short_fits(changed, folds, base.factor, progress, end)
     except OutOfTimeError:
         return _reject(finding, "; no time was left to try it"), base
     except (ValidationError, UserError, NonFiniteError) as error:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import repeat
 
 import drjit as dr
@@ -14,11 +15,11 @@ import numpy as np
 from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.datasets.images import smaller_view, with_arrays
-from drgs.datasets.types import Dataset, View, evenly_spaced
+from drgs.datasets.types import Dataset, evenly_spaced
 from drgs.effects.base import ShortFit
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import Start, gaussians_at, start_of
-from drgs.results.alignment import Alignment, align
+from drgs.results.alignment import align
 from drgs.training.trainer import Trainer
 
 SHORT_FIT_WIDTH_PX = 135  # about: of photographs in short fits
@@ -35,66 +36,51 @@ folds leave out others that there are 20: of 20 photographs, each is left out on
 WARM_UP_ITERATIONS = 20  # of a short fit, whose time does not count: kernels are compiled
 
 TIMED_ITERATIONS, GROWTH, NUM_FITS = 10, 1.6, 2
-"""A plan for a given time: iterations that are timed; the time of later ones, with more Gaussians,
-and of renderings, relative to these; and fits for which there must be time: with an effect and
-without."""
+"""A plan for a given time: iterations that are timed; the time of later ones and of renderings,
+relative to these; and fits for which there must be time: with an effect and without."""
 
 
 class OutOfTimeError(Exception):
     """The time of an examination is over."""
 
 
-@dataclass(frozen=True)
-class Clock:
-    """The time that an examination may take."""
-
-    started: float  # by time.perf_counter
-    seconds: float | None = None  # None: as much as it needs
-
-    @property
-    def left(self) -> float:
-        """Seconds that are left."""
-        return np.inf if self.seconds is None else self.seconds - self.passed
-
-    @property
-    def passed(self) -> float:
-        """Seconds so far."""
-        return time.perf_counter() - self.started
-
-    def check(self) -> None:
-        """Raise :class:`OutOfTimeError` if it is over."""
-        if self.left < 0:
-            raise OutOfTimeError
+def check_time(end: float) -> None:
+    """Raise :class:`OutOfTimeError` after ``end``, by ``time.perf_counter``."""
+    if time.perf_counter() > end:
+        raise OutOfTimeError
 
 
 def plan_short_fits(
-    config: FitConfig, folds: Sequence[Dataset], clock: Clock
+    config: FitConfig, folds: Sequence[Dataset], end: float
 ) -> tuple[FitConfig, Sequence[Dataset], str]:
     """Return iterations and folds for which there is time, and what was made smaller.
 
     config: of a short fit. Raises :class:`OutOfTimeError` if there is no time for the least.
     """
-    if clock.seconds is None:
+    if end == math.inf:
         return config, folds, ""
     trainer = _make_trainer(config, folds[0])
-    for iteration in range(WARM_UP_ITERATIONS + TIMED_ITERATIONS):
-        if iteration == WARM_UP_ITERATIONS:
+    for done in range(WARM_UP_ITERATIONS + TIMED_ITERATIONS):
+        check_time(end)
+        if done == WARM_UP_ITERATIONS:
             dr.sync_thread()
             started = time.perf_counter()
         trainer.step()
-        clock.check()
     trainer.check()
-    iteration_s = GROWTH * (time.perf_counter() - started) / TIMED_ITERATIONS
+    now = time.perf_counter()
     trainer.release()
-    possible = int(clock.left / NUM_FITS / iteration_s)
-    num_folds = int(np.clip(possible // config.iterations, 1, len(folds)))
-    iterations = min(config.iterations, possible)
-    if iterations < MIN_ITERATIONS:
+    all_iterations, all_folds = config.iterations, len(folds)
+    possible = int((end - now) / NUM_FITS / GROWTH / (now - started) * TIMED_ITERATIONS)
+    if possible < MIN_ITERATIONS:
         raise OutOfTimeError
-    smaller = [f"{iterations} of {config.iterations} iterations"] * (possible < config.iterations)
-    smaller += [f"{num_folds} of {len(folds)} folds"] * (num_folds < len(folds))
-    config = with_iterations(config, iterations) if iterations < config.iterations else config
-    return config, folds[:num_folds], ", ".join(smaller)
+    smaller = []
+    if possible < all_iterations:
+        config = with_iterations(config, possible)
+        smaller.append(f"{possible} of {all_iterations} iterations")
+    if possible < all_iterations * all_folds:
+        folds = folds[: max(1, possible // all_iterations)]
+        smaller += [f"{len(folds)} of {all_folds} folds"] * (len(folds) < all_folds)
+    return config, folds, ", ".join(smaller)
 
 
 def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
@@ -123,7 +109,7 @@ def short_fits(
     folds: Sequence[Dataset],
     factor: int,
     progress: Callable[[int, int], None],
-    clock: Clock,
+    end: float = math.inf,
     with_trained: bool = False,
 ) -> ShortFit:
     """Fit the training views of each fold, and render its test views; config: of a short fit.
@@ -131,26 +117,24 @@ def short_fits(
     Photographs that it leaves out are fitted in no fold, and tested in the first. with_trained:
     render the training views of the first fold as well.
 
-    Raises :class:`OutOfTimeError` when the clock has no time left.
+    Raises :class:`OutOfTimeError` after ``end``, by ``time.perf_counter``.
     """
-    fits, total, left_out = [], config.iterations * len(folds), {*config.data.leave_out}
+    left_out, fits = {*config.data.leave_out}, []
     for number, fold in enumerate(folds):
-        kept = tuple(view for view in fold.train if view.name not in left_out)
-        others = () if number else tuple(v for v in fold.train if v.name in left_out)
-        split = replace(fold, train=kept, test=(*fold.test, *others))
+        train = tuple(view for view in fold.train if view.name not in left_out)
+        others = () if number else tuple(view for view in fold.train if view.name in left_out)
+        split = replace(fold, train=train, test=(*fold.test, *others))
 
         def step(done: int, before: int = number * config.iterations) -> None:
-            progress(before + done, total)
-            clock.check()
+            progress(before + done, config.iterations * len(folds))
+            check_time(end)
 
         fits.append(_short_fit(config, split, factor, step, with_trained and number == 0))
-    first, join = fits[0], lambda name: [each for fit in fits for each in getattr(fit, name)]
-    tests = tuple(view for fit in fits for view in fit.dataset.test)
     return replace(
-        first,
-        dataset=replace(first.dataset, test=tests),
-        images=join("images"),
-        alignments=join("alignments"),
+        fits[0],
+        dataset=replace(fits[0].dataset, test=tuple(v for fit in fits for v in fit.dataset.test)),
+        images=[image for fit in fits for image in fit.images],
+        alignments=[alignment for fit in fits for alignment in fit.alignments],
         wall_s=sum(fit.wall_s for fit in fits),
     )
 
@@ -172,24 +156,15 @@ def _short_fit(
             dr.sync_thread()
             started = time.perf_counter()
     trainer.check()  # waits for the device
-    wall_s = time.perf_counter() - started
-    images = [np.asarray(image)[..., :3] for image in trainer.images(split.test)]
-    alignments = _align(split.test, images, split.background)
-    seen = trainer.images(split.train) if with_trained else ()
-    seen = [np.asarray(image)[..., :3] for image in seen]
-    trained = _align(split.train[: len(seen)], seen, split.background)
+    wall_s, count = time.perf_counter() - started, len(split.test)
+    views = (*split.test, *split.train) if with_trained else split.test
+    images = [np.asarray(image)[..., :3] for image in trainer.images(views)]
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(align, views, images, repeat(split.background)))
+    tested, trained = (images[:count], found[:count]), (found[count:], images[count:])
     gaussians = trainer.gaussians()
     trainer.release()
-    return ShortFit(
-        trainer.config, split, gaussians, images, alignments, factor, wall_s, trained, seen
-    )
-
-
-def _align(
-    views: Sequence[View], images: Iterable[np.ndarray], background: tuple[float, float, float]
-) -> list[Alignment]:
-    with ThreadPoolExecutor() as pool:
-        return list(pool.map(align, views, images, repeat(background)))
+    return ShortFit(trainer.config, split, gaussians, *tested, factor, wall_s, *trained)
 
 
 def _make_trainer(config: FitConfig, split: Dataset) -> Trainer:

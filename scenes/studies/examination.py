@@ -25,9 +25,11 @@ import drgs
 import numpy as np
 from clean_sets import KINDS, ROOM, clean_set
 from drgs.cameras.radial_tangential import RadialTangential
+from drgs.cli.execution import select_variant
 from drgs.config.changes import with_changes
 from drgs.config.load import config_from
 from drgs.config.schema import FitConfig
+from drgs.core.environment import VARIANTS
 from drgs.datasets.folders import config_for
 from drgs.datasets.types import Dataset, View
 from drgs.examine.examination import Decision
@@ -429,6 +431,7 @@ def main() -> None:
     parser.add_argument("--effect", help="measure this one alone")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
+    select_variant(VARIANTS[0])
     if args.only != "fits":
         measure_alarms(args.folders, args.rows, args.effect)
         print("\n".join(table_of_alarms(args.rows)))

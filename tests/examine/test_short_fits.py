@@ -10,7 +10,7 @@ import drgs
 from drgs.config.load import config_from
 from drgs.core.registry import temporary_registrations
 from drgs.examine import short_fits
-from drgs.examine.short_fits import Clock, OutOfTimeError, plan_short_fits, shorten, split_views
+from drgs.examine.short_fits import OutOfTimeError, plan_short_fits, shorten, split_views
 from drgs.fit.budget import Budget
 from drgs.fit.session import FitSession
 from drgs.initialization.defaults import resolve_defaults
@@ -28,19 +28,19 @@ def plan_for(monkeypatch):
         ticks = count()
         clock = SimpleNamespace(perf_counter=lambda: 0.1 * next(ticks))
         monkeypatch.setattr(short_fits, "time", clock)
-        config_then, folds_then, smaller = plan_short_fits(config, folds, Clock(0.0, seconds))
+        config_then, folds_then, smaller = plan_short_fits(config, folds, seconds)
         return config_then.iterations, len(folds_then), smaller
 
     return plan
 
 
 def test_an_examination_is_as_large_as_there_is_time(plan_for):
-    assert plan_for(None) == plan_for(1000.0) == (500, 2, "")
-    # 10 iterations look at the clock 11 times: 0.176 s each, as they grow; and two short fits.
+    assert plan_for(float("inf")) == plan_for(1000.0) == (500, 2, "")
+    # 10 iterations look at the clock 10 times: 0.16 s each, as they grow; and two short fits.
     iterations, folds, smaller = plan_for(200.0)
     assert (iterations, folds, smaller) == (500, 1, "1 of 2 folds")
     iterations, folds, smaller = plan_for(120.0)
-    assert iterations == pytest.approx((120 - 3.2) / 2 / 0.176, abs=2) and folds == 1
+    assert iterations == pytest.approx((120 - 3.2) / 2 / 0.16, abs=2) and folds == 1
     assert smaller == f"{iterations} of 500 iterations, 1 of 2 folds"
 
 
