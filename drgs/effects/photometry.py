@@ -188,14 +188,7 @@ def _finding(name: str, stage: int, fit: ShortFit) -> Finding | None:
         return None
     value = float(-np.min(middles) if name == "vignetting" else np.ptp(middles))
     text, least = EVIDENCE[name]
-    if stage and value < least[stage]:
-        return None
-    return Finding(
-        name,
-        text.format(value),
-        is_likely=value > least[stage],
-        changes={f"colors.{name}_lr": EXAMINED_LRS[name]},
-        in_short_fits={f"colors.{name}_lr": SHORT_FIT_LR},
-        confirm=partial(_finding, name, 1),
-        max_loss=MAX_LOSS_DB,
-    )
+    changes, rates = ({f"colors.{name}_lr": lr} for lr in (EXAMINED_LRS[name], SHORT_FIT_LR))
+    likely, confirm = value > least[stage], partial(_finding, name, 1)
+    found = Finding(name, text.format(value), likely, changes, rates, "", confirm, MAX_LOSS_DB)
+    return None if stage and not likely else found

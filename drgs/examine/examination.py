@@ -38,8 +38,8 @@ from drgs.examine.short_fits import (
     SHARE_OF_ITERATIONS,
     OutOfTimeError,
     check_time,
+    fit_folds,
     plan_short_fits,
-    short_fits,
     shorten,
     split_views,
 )
@@ -162,7 +162,7 @@ def examine(
         select_variant(VARIANTS[0])
     try:
         short, folds, smaller = plan_short_fits(short, folds, end)
-        base = short_fits(short, folds, factor, partial(progress, "baseline"), end, True)
+        base = fit_folds(short, folds, factor, partial(progress, "baseline"), end, True)
     except OutOfTimeError:
         note = f"short fits take longer than the {seconds:.0f} s that --budget leaves for them"
         return Examination((), 0, time.perf_counter() - started, note)
@@ -190,7 +190,7 @@ def _try(
     try:
         check_time(end - base.wall_s)
         changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
-        tried = short_fits(changed, folds, base.factor, progress, end)
+        tried = fit_folds(changed, folds, base.factor, progress, end)
     except OutOfTimeError:
         return _reject(finding, "; no time was left to try it"), base
     except (ValidationError, UserError, NonFiniteError) as error:

@@ -56,16 +56,11 @@ def look_for_bad_photographs(fit: ShortFit, among: Collection[str] | None = None
         return None
     shown = "; ".join(f"{name} is {why}" for name, why in [*found.items()][:MAX_SHOWN])
     shown += f"; {len(found) - MAX_SHOWN} more" if len(found) > MAX_SHOWN else ""
+    shown = shown or "none differs from its rendering more than others do"
     is_likely = 0 < len(found) <= MAX_SHARE * (len(fit.dataset.train) + len(fit.dataset.test))
-    words = " ".join(f"--leave-out {name}" for name in found)
-    return Finding(
-        "bad photographs",
-        shown or "none differs from its rendering more than others do",
-        is_likely=is_likely,
-        changes={"data.leave_out": [*found]},
-        advice=words if among is not None else "",
-        confirm=partial(look_for_bad_photographs, among=[*found]),
-    )
+    words = "" if among is None else " ".join(f"--leave-out {name}" for name in found)
+    changes, confirm = {"data.leave_out": [*found]}, partial(look_for_bad_photographs, among=found)
+    return Finding("bad photographs", shown, is_likely, changes, {}, words, confirm)
 
 
 def look_for_moving_things(fit: ShortFit) -> Finding:

@@ -69,18 +69,14 @@ def plan_short_fits(
     trainer.check()
     now = time.perf_counter()
     trainer.release()
-    all_iterations, all_folds = config.iterations, len(folds)
     possible = int((end - now) / NUM_FITS / GROWTH / (now - started) * TIMED_ITERATIONS)
+    iterations, count = min(possible, config.iterations), max(1, possible // config.iterations)
     if possible < MIN_ITERATIONS:
         raise OutOfTimeError
-    smaller = []
-    if possible < all_iterations:
-        config = with_iterations(config, possible)
-        smaller.append(f"{possible} of {all_iterations} iterations")
-    if possible < all_iterations * all_folds:
-        folds = folds[: max(1, possible // all_iterations)]
-        smaller += [f"{len(folds)} of {all_folds} folds"] * (len(folds) < all_folds)
-    return config, folds, ", ".join(smaller)
+    if iterations == config.iterations and count >= len(folds):
+        return config, folds, ""
+    text = f"{iterations} of {config.iterations} iterations, {min(count, len(folds))} folds"
+    return with_iterations(config, iterations), folds[:count], text
 
 
 def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
@@ -104,7 +100,7 @@ def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
     return folds, factor
 
 
-def short_fits(
+def fit_folds(
     config: FitConfig,
     folds: Sequence[Dataset],
     factor: int,

@@ -75,9 +75,9 @@ class Budget:
         return min(REHEARSAL_SHARE * self.seconds, MAX_REHEARSAL_S)
 
     @property
-    def left(self) -> float:
-        """Seconds until the end."""
-        return self.end - time.perf_counter()
+    def examination_s(self) -> float:
+        """Seconds of an examination, from now."""
+        return max(0.0, min(EXAMINATION_SHARE * self.seconds, self.end - time.perf_counter()))
 
 
 @dataclass(frozen=True)

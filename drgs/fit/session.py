@@ -30,7 +30,7 @@ from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.folders import config_for
 from drgs.effects.base import ChosenEffects, Examiner, TrainingEffect
-from drgs.fit.budget import EXAMINATION_SHARE, Budget, Plan, deadline, plan_fit, rehearse
+from drgs.fit.budget import Budget, Plan, deadline, plan_fit, rehearse
 from drgs.fit.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.fit.fingerprint import Fingerprint, fingerprint_of
 from drgs.fit.fit_folder import FitFolder, saved_gaussians
@@ -210,9 +210,8 @@ class FitSession:
             return
         examine: Examiner = EXAMINERS.get(names[0]).value
         with StepProgress("examining: ") if self.uses_terminal else nullcontext() as steps:
-            update, seconds = None if steps is None else steps.update, None
-            if self.budget is not None:
-                seconds = min(EXAMINATION_SHARE * self.budget.seconds, self.budget.left)
+            update = None if steps is None else steps.update
+            seconds = None if self.budget is None else self.budget.examination_s
             self.examination = examine(dataset, given, update, seconds)
         self._print(str(self.examination))
         changes = self.examination.changes
