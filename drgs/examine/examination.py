@@ -32,17 +32,8 @@ from drgs.core.errors import UserError, one_line
 from drgs.datasets.types import Dataset
 from drgs.effects.base import Finding, Progress, ShortFit
 from drgs.effects.photometry import camera_key
+from drgs.examine import short_fits
 from drgs.examine.photographs import look_for_bad_photographs, look_for_moving_things
-from drgs.examine.short_fits import (
-    MIN_ITERATIONS,
-    SHARE_OF_ITERATIONS,
-    OutOfTimeError,
-    check_time,
-    fit_folds,
-    plan_short_fits,
-    shorten,
-    split_views,
-)
 from drgs.initialization.defaults import resolve_defaults
 from drgs.training.finite_checks import NonFiniteError
 
@@ -155,15 +146,15 @@ def examine(
         config = config_from(values, "examine(): config")
     if note := _reason_not_examined(config, dataset):
         return Examination((), 0, 0.0, note)
-    given, short = given_keys(config), shorten(resolve_defaults(config, dataset))
-    folds, factor = split_views(dataset)
+    given, short = given_keys(config), short_fits.shorten(resolve_defaults(config, dataset))
+    folds, factor = short_fits.split_views(dataset)
     progress = progress or (lambda what, done, total: None)
     if mi.variant() is None:
         select_variant(VARIANTS[0])
     try:
-        short, folds, smaller = plan_short_fits(short, folds, end)
-        base = fit_folds(short, folds, factor, partial(progress, "baseline"), end, True)
-    except OutOfTimeError:
+        short, folds, smaller = short_fits.plan_short_fits(short, folds, end)
+        base = short_fits.fit_folds(short, folds, factor, partial(progress, "baseline"), end, True)
+    except short_fits.OutOfTimeError:
         note = f"short fits take longer than the {seconds:.0f} s that --budget leaves for them"
         return Examination((), 0, time.perf_counter() - started, note)
     decisions = []
@@ -188,10 +179,10 @@ def _try(
     if not finding.is_likely:
         return _reject(finding), base
     try:
-        check_time(end - base.wall_s)
+        short_fits.check_time(end - base.wall_s)
         changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
-        tried = fit_folds(changed, folds, base.factor, progress, end)
-    except OutOfTimeError:
+        tried = short_fits.fit_folds(changed, folds, base.factor, progress, end)
+    except short_fits.OutOfTimeError:
         return _reject(finding, "; no time was left to try it"), base
     except (ValidationError, UserError, NonFiniteError) as error:
         return _reject(finding, f"; could not be tried: {one_line(error, 100)}"), base
@@ -263,7 +254,10 @@ def _reject(finding: Finding, reason: str = "") -> Decision:
 
 
 def _reason_not_examined(config: FitConfig, dataset: Dataset) -> str:
-    count, least = len(dataset.train), round(MIN_ITERATIONS / SHARE_OF_ITERATIONS)
+    count, least = (
+        len(dataset.train),
+        round(short_fits.MIN_ITERATIONS / short_fits.SHARE_OF_ITERATIONS),
+    )
     if count < MIN_VIEWS:
         return f"{count} training photographs are fewer than {MIN_VIEWS}"
     if config.iterations < least:

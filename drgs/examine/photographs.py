@@ -65,10 +65,7 @@ def look_for_bad_photographs(fit: ShortFit, among: Collection[str] | None = None
 
 def look_for_moving_things(fit: ShortFit) -> Finding:
     """Return whether many photographs have a region that no other one agrees with."""
-    alignments = [*fit.alignments, *fit.trained]
-    typical = _typical_difference(alignments)
-    regions = np.array([_largest_region(one, typical) for one in alignments])
-    share = float((regions > COVERED_SHARES[0]).mean())
+    share = float((_regions([*fit.alignments, *fit.trained]) > COVERED_SHARES[0]).mean())
     advice = "masks (mask_path); reflections that are not simulated look the same"
     text = f"{share:.0%} of photographs have a region that is in no other"
     return Finding("things that move", text, False, {}, advice=advice if share > MANY else "")
@@ -98,14 +95,14 @@ def _outliers(
     softer = -_deviations([a.sharpness for a in alignments], LEAST_DEVIATIONS["sharpness"])
     full = np.array([(np.asarray(v.image).min(axis=2) > FULL).mean() for v in views])
     full -= [(image.min(axis=2) > FULL).mean() for image in images]
-    typical = _typical_difference(alignments)
+    covered = _regions(alignments)
     found = {}
     for index, (view, one) in enumerate(zip(views, alignments, strict=True)):
         is_bright = one.gains.mean() > MIN_BRIGHTER
         if is_bright and full[index] - np.median(full) > MIN_FULL_SHARE:
             found[view.name] = f"overexposed ({full[index]:.0%} of it is white)"
         elif worse[index] > MAX_DEVIATIONS:
-            found[view.name] = _why_worse(view, one, renderings, typical)
+            found[view.name] = _why_worse(view, renderings, covered[index])
         if softer[index] > MAX_DEVIATIONS and found.get(view.name, ELSEWHERE) == ELSEWHERE:
             found[view.name] = f"blurred (steps x {np.exp(one.sharpness):.2f})"
     return found
@@ -117,30 +114,23 @@ def _deviations(values: Sequence[float], least: float) -> np.ndarray:
     return off / max(NORMAL * float(np.median(np.abs(off))), least)
 
 
-def _why_worse(
-    view: View, alignment: Alignment, renderings: dict[str, np.ndarray], typical: float
-) -> str:
+def _why_worse(view: View, renderings: dict[str, np.ndarray], covered: float) -> str:
     photograph = _thumbnail(np.asarray(view.image))
     alike = {name: float(np.mean(photograph * _thumbnail(r))) for name, r in renderings.items()}
     best = max(alike, key=alike.__getitem__)
     if alike[best] > max(MIN_SIMILARITY, alike[view.name] + MIN_ADVANTAGE):
         return f"swapped (resembles the view of {best})"
-    share = _largest_region(alignment, typical)
-    if COVERED_SHARES[0] < share < COVERED_SHARES[1] and alike[view.name] > MIN_SIMILARITY:
-        return f"something before the camera ({share:.0%} of it)"
+    if COVERED_SHARES[0] < covered < COVERED_SHARES[1] and alike[view.name] > MIN_SIMILARITY:
+        return f"something before the camera ({covered:.0%} of it)"
     return ELSEWHERE
 
 
-def _typical_difference(alignments: Sequence[Alignment]) -> float:
+def _regions(alignments: Sequence[Alignment]) -> np.ndarray:
+    """Return the share of the largest connected region of pixels that differ, of each."""
     medians = [np.median(one.left[one.left > 0]) for one in alignments if one.left.any()]
-    return float(np.median(medians or [1.0]))
-
-
-def _largest_region(alignment: Alignment, typical: float) -> float:
-    """Return the share of the largest connected region of pixels that differ."""
-    differs = ndimage.uniform_filter(alignment.left, 3) > COVERED_DEVIATIONS * typical
-    regions, _ = ndimage.label(differs)
-    return float(max(np.bincount(regions.ravel())[1:], default=0) / differs.size)
+    least = COVERED_DEVIATIONS * np.median(medians or [1.0])
+    labels = [ndimage.label(ndimage.uniform_filter(a.left, 3) > least)[0] for a in alignments]
+    return np.array([max(np.bincount(each.ravel())[1:], default=0) / each.size for each in labels])
 
 
 def _thumbnail(image: np.ndarray) -> np.ndarray:

@@ -28,6 +28,8 @@ SHARE_OF_ITERATIONS, MAX_ITERATIONS, MIN_ITERATIONS = 1 / 6, 500, 250
 """A short fit has this share of the fit's iterations, within these bounds; a fit that is shorter
 than six times the least is not examined."""
 
+MIN_ITERATIONS_OF_FIT = round(MIN_ITERATIONS / SHARE_OF_ITERATIONS)
+
 MAX_VIEWS = 160  # photographs of an examination
 NUM_HELD_OUT, HELD_OUT_STRIDE, FEW_HELD_OUT = 10, (4, 8), 20
 """Photographs that are left out, about: one in four to one in eight. Below 50 photographs, so many

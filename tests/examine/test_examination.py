@@ -22,14 +22,8 @@ from drgs.core.registry import temporary_registrations
 from drgs.effects.base import Finding, TrainingEffect
 from drgs.effects.colors import exposure_spread
 from drgs.examine import __main__ as command
-from drgs.examine.examination import (
-    Examination,
-    decide,
-    given_keys,
-    middle_of,
-    overlaps,
-    split_views,
-)
+from drgs.examine.examination import Examination, decide, given_keys, middle_of, overlaps
+from drgs.examine.short_fits import split_views
 
 ITERATIONS = 1500  # of a fit: the fewest that are examined
 NAMES = ["background of one colour", "bad photographs", "exposure and white balance"]

@@ -4,11 +4,11 @@ from itertools import count
 from types import SimpleNamespace
 
 import pytest
-from support.small_capture import make_dataset
+from support.small_capture import make_dataset, write_dataset
 
 import drgs
 from drgs.config.load import config_from
-from drgs.core.registry import temporary_registrations
+from drgs.datasets import load_dataset
 from drgs.examine import short_fits
 from drgs.examine.short_fits import OutOfTimeError, plan_short_fits, shorten, split_views
 from drgs.fit.budget import Budget
@@ -56,21 +56,35 @@ def test_an_examination_that_takes_too_long_is_none_and_says_so():
     assert str(found).startswith("not examined: short fits take longer than the 0 s")
 
 
-def test_a_fit_gives_an_examination_a_tenth_of_its_budget(monkeypatch):
+def install(monkeypatch, result):
+    """Let an examiner return ``result``; return the seconds that it is given."""
     given = []
-    with temporary_registrations():
-        result = SimpleNamespace(changes={})
-        monkeypatch.setattr(
-            "drgs.fit.session.EXAMINERS",
-            SimpleNamespace(
-                names=lambda: ["mine"],
-                get=lambda name: SimpleNamespace(
-                    value=lambda data, config, update, seconds: given.append(seconds) or result
-                ),
-            ),
-        )
-        config = config_from({"data": {"path": "."}}, "test")
-        for budget in (None, Budget(300.0, 1e12), Budget(300.0, -1e12)):
-            session = FitSession(config, make_dataset(4), budget=budget)
-            session._examine(config)
-    assert given[:2] == [None, 30.0] and given[2] == 0
+
+    def examine(dataset, config, update, seconds):
+        given.append(seconds)
+        return result
+
+    found = SimpleNamespace(value=examine)
+    registry = SimpleNamespace(names=lambda: ["mine"], get=lambda name: found)
+    monkeypatch.setattr("drgs.fit.session.EXAMINERS", registry)
+    return given
+
+
+def test_a_fit_gives_an_examination_a_tenth_of_its_budget(monkeypatch):
+    given = install(monkeypatch, SimpleNamespace(changes={}))
+    config = config_from({"data": {"path": "."}}, "test")
+    for budget in (None, Budget(300.0, 1e12), Budget(300.0, -1e12)):
+        FitSession(config, make_dataset(4), budget=budget)._examine(config)
+    assert given == [None, 30.0, 0.0]
+
+
+def test_photographs_that_are_chosen_to_be_left_out_are_left_out(monkeypatch, tmp_path):
+    install(monkeypatch, SimpleNamespace(changes={"data.leave_out": ["r_1"]}))
+    write_dataset(tmp_path, make_dataset(4))
+    config = config_from({"data": {"path": str(tmp_path)}}, "test")
+    session = FitSession(config, load_dataset(config.data), folder=SimpleNamespace())
+    session._examine(config)
+    names = [view.name for view in session.dataset.train]
+    assert [name.rpartition("/")[2] for name in names] == ["r_0", "r_2", "r_3"]
+    assert session.config.data.leave_out == ["r_1"]
+    assert [view.name for view in session._fingerprint.train] == names
