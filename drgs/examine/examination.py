@@ -46,6 +46,8 @@ Leaving these out makes 0.97 of it, for normal gains."""
 
 MIN_CAMERA_VIEWS = 8  # held-out, of a camera whose gains alone may count
 
+MIN_RESEMBLANCE = 0.6  # of short fits; 0.89 to 0.98, and 0.36 of dark ones that stay blurred
+
 BORDER_PX, BORDER_TOLERANCE, MIN_BORDER_SHARE = 2, 0.04, 0.6
 """A background of one colour: of each photograph's border, this share has it, but for this."""
 
@@ -157,6 +159,9 @@ def examine(
     except short_fits.OutOfTimeError:
         note = f"short fits take longer than the {seconds:.0f} s that --budget leaves for them"
         return Examination((), 0, time.perf_counter() - started, note)
+    if (alike := _resemblance(base)) < MIN_RESEMBLANCE:
+        note = f"short fits have {alike:.0%} of the photographs' variance, too little to compare"
+        return Examination((), 0, time.perf_counter() - started, note)
     decisions = []
     for finding in _findings(base):
         if any(overlaps(key, other) for key in finding.changes for other in given):
@@ -166,6 +171,13 @@ def examine(
     num_held_out = sum(len(fold.test) for fold in folds)
     wall_s = time.perf_counter() - started
     return Examination(tuple(decisions), num_held_out, wall_s, smaller=smaller)
+
+
+def _resemblance(fit: ShortFit) -> float:
+    """Return the middle share of training photographs' variance that renderings explain."""
+    pairs = zip(fit.dataset.train, fit.trained_images, strict=True)
+    left = [np.mean(np.square(np.asarray(v.image) - i)) / np.var(v.image) for v, i in pairs]
+    return float(1 - np.median(left))
 
 
 def _try(
@@ -292,7 +304,9 @@ def _look_for_background(fit: ShortFit) -> Finding | None:
     deviations = [border - color for border, color in zip(borders, colors, strict=True)]
     share = float((np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1).mean())
     color = np.median(colors, axis=0)
-    is_other = np.abs(color - fit.config.data.background_rgb).max() > BORDER_TOLERANCE
+    spread = np.median(np.abs(np.array(colors) - color), axis=0)  # by exposure
+    other = np.abs(color - fit.config.data.background_rgb) - 2 * spread
+    is_other = other.max() > BORDER_TOLERANCE
     background = tuple(round(float(value), 3) for value in color)
     shown = ", ".join(f"{value:.2f}" for value in background)
     return Finding(

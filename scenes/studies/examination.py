@@ -294,17 +294,20 @@ FIELDS = ("effect", "strength", "seed", "set", "chosen", "gain", "others", "bad"
 
 
 def alarms(folders: Sequence[Path]) -> Iterator[tuple[str, float, int, Path, Effect | None]]:
-    """Yield all cases of table 1: those without an effect first, then seed by seed."""
-    for seed in range(NUM_CASES):
-        for kind in CLEAN_KINDS:
-            yield NOTHING, 0.0, seed, Path(f"{kind}@{seed}"), None
-        yield NOTHING, 0.0, seed, folders[seed % len(folders)], None
-    for seed in range(NUM_CASES):
-        for middle_first in (1, 2, 0):
+    """Yield all cases of table 1, seed by seed: without an effect first, and the middle strength."""
+    for places in ((1,), (0, 2)):
+        for seed in range(NUM_CASES):
+            for folder in (
+                *(Path(f"{k}@{seed}") for k in CLEAN_KINDS),
+                folders[seed % len(folders)],
+            ):
+                if places == (1,):
+                    yield NOTHING, 0.0, seed, folder, None
             for effect in EFFECTS:
                 usable = folders[:1] if effect.name == "background" else folders
-                folder = usable[seed % len(usable)]
-                yield effect.name, effect.strengths[middle_first], seed, folder, effect
+                for place in places:
+                    folder = usable[seed % len(usable)]
+                    yield effect.name, effect.strengths[place], seed, folder, effect
 
 
 def measure_alarms(folders: Sequence[Path], path: Path, only: str | None) -> None:
