@@ -174,9 +174,9 @@ def examine(
 
 
 def _resemblance(fit: ShortFit) -> float:
-    """Return the middle share of training photographs' variance that renderings explain."""
-    pairs = zip(fit.dataset.train, fit.trained_images, strict=True)
-    left = [np.mean(np.square(np.asarray(v.image) - i)) / np.var(v.image) for v, i in pairs]
+    """Return the middle share of training photographs' variance that aligned renderings explain."""
+    pairs = zip(fit.dataset.train, fit.trained, strict=True)
+    left = [10 ** (-one.psnr / 10) / np.var(np.asarray(view.image)) for view, one in pairs]
     return float(1 - np.median(left))
 
 
@@ -305,7 +305,7 @@ def _look_for_background(fit: ShortFit) -> Finding | None:
     share = float((np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1).mean())
     color = np.median(colors, axis=0)
     spread = np.median(np.abs(np.array(colors) - color), axis=0)  # by exposure
-    other = np.abs(color - fit.config.data.background_rgb) - 2 * spread
+    other = np.abs(color - fit.config.data.background_rgb) - 3 * spread
     is_other = other.max() > BORDER_TOLERANCE
     background = tuple(round(float(value), 3) for value in color)
     shown = ", ".join(f"{value:.2f}" for value in background)

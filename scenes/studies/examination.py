@@ -294,7 +294,7 @@ FIELDS = ("effect", "strength", "seed", "set", "chosen", "gain", "others", "bad"
 
 
 def alarms(folders: Sequence[Path]) -> Iterator[tuple[str, float, int, Path, Effect | None]]:
-    """Yield all cases of table 1, seed by seed: without an effect first, and the middle strength."""
+    """Yield all cases of table 1, seed by seed, those of the middle strength first."""
     for places in ((1,), (0, 2)):
         for seed in range(NUM_CASES):
             for folder in (
