@@ -254,8 +254,9 @@ def _counts(gains: np.ndarray, confidence: float) -> bool:
     middle, _ = middle_of(gains)
     order = np.argsort(np.abs(gains - middle), kind="stable")
     kept = gains[order[: len(gains) - int(TRIMMED * len(gains))]]
-    is_sure = wilcoxon(kept, alternative="greater").pvalue <= 1 - confidence
-    return bool(middle > MIN_GAIN_DB and is_sure)
+    if middle <= MIN_GAIN_DB:  # ranks of zeros have no deviation
+        return False
+    return bool(wilcoxon(kept, alternative="greater").pvalue <= 1 - confidence)
 
 
 def _reject(finding: Finding, reason: str = "") -> Decision:
