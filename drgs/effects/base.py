@@ -84,6 +84,11 @@ class ShortFit:
         """The held-out views' PSNR, (V,) dB, with the differences of a camera removed."""
         return np.array([alignment.psnr for alignment in self.alignments])
 
+    @property
+    def toned_psnr(self) -> np.ndarray:
+        """The same, also without vignetting and response."""
+        return np.array([alignment.toned_psnr for alignment in self.alignments])
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -176,7 +176,7 @@ def examine(
 def _resemblance(fit: ShortFit) -> float:
     """Return the middle share of training photographs' variance that aligned renderings explain."""
     pairs = zip(fit.dataset.train, fit.trained, strict=True)
-    left = [10 ** (-one.psnr / 10) / np.var(np.asarray(view.image)) for view, one in pairs]
+    left = [10 ** (-one.toned_psnr / 10) / np.var(np.asarray(view.image)) for view, one in pairs]
     return float(1 - np.median(left))
 
 
@@ -216,9 +216,12 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
     and Lehmann 1963), which a few that differ do not move, nor do they spread it. It counts where
     it does over all photographs, or over those of one camera while others do not lose.
     """
+    pairs = (without.psnr, fitted.psnr)
+    if finding.max_loss is not None:  # renderings of held-out views have no vignetting
+        pairs = (without.toned_psnr, fitted.toned_psnr)
     before, after = (
-        {view.name: psnr for view, psnr in zip(fit.dataset.test, fit.psnr, strict=True)}
-        for fit in (without, fitted)
+        {view.name: psnr for view, psnr in zip(fit.dataset.test, values, strict=True)}
+        for fit, values in zip((without, fitted), pairs, strict=True)
     )
     kept = before.keys() - {*fitted.config.data.leave_out}
     views = [view for view in fitted.dataset.test if view.name in kept]

@@ -40,7 +40,8 @@ class Alignment:
 
     gains: np.ndarray  # (3,): the photograph's brightness relative to the rendering's, minus 1
     shift: np.ndarray  # (2,) px: from the rendering's content to the photograph's
-    psnr: float  # dB, of the rendering without these differences, vignetting and response
+    psnr: float  # dB, of the rendering without these differences
+    toned_psnr: float  # dB, also without vignetting and response
     vignetting: float  # brightness of corners relative to the middle's, minus 1
     response: float  # logarithm of the exponent by which the photograph's colours differ
     zoom: float  # px at half the diagonal
@@ -78,22 +79,23 @@ def align(
         gains, moved = numbers[:3], moved + numbers[3:]
     at, is_covered = _move(image, moved)
     seen, left, others = counts * is_covered, photograph - at - gains * (at - behind), np.zeros(8)
-    error = _mean_error(left, seen)
+    error = toned = _mean_error(left, seen)
     if min(height, width) >= MIN_SIDE_PX:
         base = (1 + gains) * (at - behind)
         smooth = ndimage.gaussian_filter(left, blur)
         others = _fit_numbers(_other_directions(base, at, blur), smooth, seen)
         further = left - _other_directions(base, at, (0, 0, 0))[..., :3] @ others[:3]
         if (after := _mean_error(further, seen)) < error:
-            left, error = further, after
+            left, toned = further, after
     farthest = max(np.abs(moved).max(), np.abs(others[3:]).max()) / (np.hypot(width, height) / 2)
-    if is_covered.mean() < MIN_COVERED or farthest > MAX_MOVE or not error < before:
+    if is_covered.mean() < MIN_COVERED or farthest > MAX_MOVE or not toned < before:
         gains, moved, others = np.zeros(3), np.zeros(4), np.zeros(8)
-        at, seen, left, error = image, counts, photograph - image, before
+        at, seen, left, error, toned = image, counts, photograph - image, before, before
     return Alignment(
         gains=gains,
         shift=moved[:2],
-        psnr=-10 * float(np.log10(max(error, 1e-10))),
+        psnr=-10 * float(np.log10(max(min(error, before), 1e-10))),
+        toned_psnr=-10 * float(np.log10(max(toned, 1e-10))),
         vignetting=float(others[1]),
         response=float(others[2]),
         zoom=float(moved[2] + others[3]),

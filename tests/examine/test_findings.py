@@ -97,7 +97,13 @@ def test_what_is_confirmed_may_lose_a_little():
         config = SimpleNamespace(data=SimpleNamespace(leave_out=[]))
         dataset = SimpleNamespace(test=make_dataset(10).train)
         without, fitted = (
-            SimpleNamespace(config=config, dataset=dataset, psnr=np.full(10, psnr), wall_s=1.0)
+            SimpleNamespace(
+                config=config,
+                dataset=dataset,
+                psnr=np.zeros(10),
+                toned_psnr=np.full(10, psnr),
+                wall_s=1.0,
+            )
             for psnr in (30.0, 30.0 - loss)
         )
         assert decide(found, without, fitted).chosen is chosen
