@@ -259,7 +259,8 @@ def _counts(gains: np.ndarray, confidence: float) -> bool:
     kept = gains[order[: len(gains) - int(TRIMMED * len(gains))]]
     if middle <= MIN_GAIN_DB:  # ranks of zeros have no deviation
         return False
-    return bool(wilcoxon(kept, alternative="greater").pvalue <= 1 - confidence)
+    _, chance = cast("tuple[float, float]", wilcoxon(kept, alternative="greater"))
+    return bool(chance <= 1 - confidence)
 
 
 def _reject(finding: Finding, reason: str = "") -> Decision:
@@ -308,9 +309,7 @@ def _look_for_background(fit: ShortFit) -> Finding | None:
     deviations = [border - color for border, color in zip(borders, colors, strict=True)]
     share = float((np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1).mean())
     color = np.median(colors, axis=0)
-    spread = np.median(np.abs(np.array(colors) - color), axis=0)  # by exposure
-    other = np.abs(color - fit.config.data.background_rgb) - 3 * spread
-    is_other = other.max() > BORDER_TOLERANCE
+    is_other = np.abs(color - fit.config.data.background_rgb).max() > BORDER_TOLERANCE
     background = tuple(round(float(value), 3) for value in color)
     shown = ", ".join(f"{value:.2f}" for value in background)
     return Finding(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from functools import partial
+from typing import cast
 
 import numpy as np
 from scipy import ndimage
@@ -129,7 +130,8 @@ def _regions(alignments: Sequence[Alignment]) -> np.ndarray:
     """Return the share of the largest connected region of pixels that differ, of each."""
     medians = [np.median(one.left[one.left > 0]) for one in alignments if one.left.any()]
     least = COVERED_DEVIATIONS * np.median(medians or [1.0])
-    labels = [ndimage.label(ndimage.uniform_filter(a.left, 3) > least)[0] for a in alignments]
+    differs = [ndimage.uniform_filter(one.left, 3) > least for one in alignments]
+    labels = [cast("tuple[np.ndarray, int]", ndimage.label(each))[0] for each in differs]
     return np.array([max(np.bincount(each.ravel())[1:], default=0) / each.size for each in labels])
 
 
@@ -137,5 +139,5 @@ def _thumbnail(image: np.ndarray) -> np.ndarray:
     """Return a small image of mean 0 and deviation 1."""
     factors = SIDE_PX / image.shape[0], SIDE_PX / image.shape[1], 1
     blur = 0.5 / factors[0], 0.5 / factors[1], 0
-    small = ndimage.zoom(ndimage.gaussian_filter(image, blur), factors, order=1)
+    small = np.asarray(ndimage.zoom(ndimage.gaussian_filter(image, blur), factors, order=1))
     return (small - small.mean()) / max(float(small.std()), 1e-6)

@@ -61,7 +61,7 @@ def plan_short_fits(
     """
     if end == math.inf:
         return config, folds, ""
-    trainer = _make_trainer(config, folds[0])
+    trainer, started = _make_trainer(config, folds[0]), 0.0
     for done in range(WARM_UP_ITERATIONS + TIMED_ITERATIONS):
         check_time(end)
         if done == WARM_UP_ITERATIONS:
