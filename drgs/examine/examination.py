@@ -29,7 +29,7 @@ from drgs.config.load import config_from
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError, one_line
-from drgs.datasets.types import Dataset
+from drgs.datasets.types import Dataset, View
 from drgs.effects.base import Finding, Progress, ShortFit
 from drgs.effects.photometry import camera_key
 from drgs.examine import short_fits
@@ -294,22 +294,40 @@ def _findings(fit: ShortFit) -> Iterator[Finding]:
     """Yield the findings of what is shipped and of installed extensions."""
     effects = sorted((extension.value for extension in EFFECTS.all()), key=lambda e: e.order)
     looks = [_look_for_background, look_for_bad_photographs, *(e.look_for for e in effects)]
+    _, share = _border_colors((*fit.dataset.train, *fit.dataset.test))
     for look in (*looks, look_for_moving_things):
         found = look(fit)
-        yield from [found] if isinstance(found, Finding) else found or ()
+        for one in [found] if isinstance(found, Finding) else found or ():
+            if one.effect == "vignetting" and one.is_likely and share >= MIN_BORDER_SHARE:
+                text = f"{one.evidence}, as before another background; photograph a wall to tell"
+                yield replace(one, evidence=text, is_likely=False)
+            else:
+                yield one
+
+
+def _border_colors(views: Sequence[View]) -> tuple[np.ndarray, float]:
+    """Return the colours (V, 3) of opaque photographs' borders, and which share of them is alike.
+
+    Photographs with transparency or masks have none.
+    """
+    if any(view.alpha is not None or view.mask is not None for view in views):
+        return np.empty((0, 3)), 0.0
+    borders = [_border(np.asarray(view.image)) for view in views]
+    colors = np.array([np.median(border, axis=0) for border in borders])
+    deviations = [border - color for border, color in zip(borders, colors, strict=True)]
+    alike = (np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1)
+    return colors, float(alike.mean())
 
 
 def _look_for_background(fit: ShortFit) -> Finding | None:
     """Compare each pixel at the border of opaque photographs with the median of its border."""
-    views = (*fit.dataset.train, *fit.dataset.test)
-    if any(view.alpha is not None or view.mask is not None for view in views):
+    colors, share = _border_colors((*fit.dataset.train, *fit.dataset.test))
+    if not len(colors):
         return None
-    borders = [_border(np.asarray(view.image)) for view in views]
-    colors = [np.median(border, axis=0) for border in borders]
-    deviations = [border - color for border, color in zip(borders, colors, strict=True)]
-    share = float((np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1).mean())
     color = np.median(colors, axis=0)
-    is_other = np.abs(color - fit.config.data.background_rgb).max() > BORDER_TOLERANCE
+    spread = np.median(np.abs(colors - color), axis=0)  # by exposure
+    other = np.abs(color - fit.config.data.background_rgb) - 3 * spread
+    is_other = other.max() > BORDER_TOLERANCE
     background = tuple(round(float(value), 3) for value in color)
     shown = ", ".join(f"{value:.2f}" for value in background)
     return Finding(
