@@ -70,17 +70,24 @@ class ShortFit:
     """A fit of few iterations to small photographs, some of which were held out."""
 
     config: FitConfig
-    dataset: Dataset  # ``test``: the held-out training photographs
+    dataset: Dataset  # ``test``: the held-out training photographs, of all folds
     gaussians: Gaussians  # numpy arrays
     images: Sequence[np.ndarray]  # (H, W, 3) display space: renderings of the held-out views
     alignments: Sequence[Alignment]  # of these
     factor: int  # px of the dataset's photographs in one of the fit's
     wall_s: float  # of its iterations
+    trained: Sequence[Alignment] = ()  # of the first fold's training views; without effects alone
+    trained_images: Sequence[np.ndarray] = ()  # (H, W, 3) display space, of these
 
     @property
     def psnr(self) -> np.ndarray:
         """The held-out views' PSNR, (V,) dB, with the differences of a camera removed."""
         return np.array([alignment.psnr for alignment in self.alignments])
+
+    @property
+    def toned_psnr(self) -> np.ndarray:
+        """The same, also without vignetting and response."""
+        return np.array([alignment.toned_psnr for alignment in self.alignments])
 
 
 @dataclass(frozen=True)
@@ -92,6 +99,10 @@ class Finding:
     is_likely: bool  # whether it is worth a short fit with the effect
     changes: Mapping[str, object]  # values of the configuration that simulate it, by key
     in_short_fits: Mapping[str, object] = field(default_factory=dict)  # further ones, such as rates
+    advice: str = ""  # what to do where it is not chosen; in place of changes, if no fit has any
+    confirm: Callable[[ShortFit], Finding | None] | None = None
+    """Returns the finding with the evidence of the fit that has the effect; None: it has none."""
+    max_loss: float | None = None  # dB, of what is confirmed; None: it is chosen by its gain
 
 
 Progress = Callable[[str, int, int], None]  # what is tried, iterations done, and of how many
@@ -115,8 +126,8 @@ class ChosenEffects(Protocol):
         ...
 
 
-Examiner = Callable[["Dataset", "FitConfig", Progress | None], ChosenEffects]
-"""Chooses effects for a dataset and a configuration, whose own values stay."""
+Examiner = Callable[["Dataset", "FitConfig", Progress | None, float | None], ChosenEffects]
+"""Chooses effects for a dataset and a configuration, whose own values stay, within some seconds."""
 
 
 class TrainingEffect(Protocol):
@@ -157,7 +168,7 @@ class TrainingEffect(Protocol):
         return make() if section is None else make(section)
 
     @classmethod
-    def look_for(cls, fit: ShortFit) -> Finding | None:
+    def look_for(cls, fit: ShortFit) -> Finding | Sequence[Finding] | None:
         """Return what a short fit without the effect shows of it; None: nothing can be said.
 
         ``drgs examine`` tries what is likely, and chooses what is worth it.

@@ -39,6 +39,9 @@ CAMERAS = "cameras.json"  # refined cameras of the training views
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
 MIN_SHIFT_PX = 0.35  # RMS, of photographs in a short fit; without wrong poses: 0.04 to 0.25
+MIN_ZOOM_PX, MIN_BEND_PX, MIN_SKEW_PX = 0.25, 0.5, 0.5
+"""The same, at corners: middles of all photographs, without: 0.1, 0.35, 0.05 to 0.4."""
+MIN_DEVIATIONS = 1.3  # of such a middle from 0; without texture: 1.2
 SHORT_FIT_RATE = 1e-3  # of poses, which a short fit moves fewer times
 
 MAX_FOCAL_FACTOR = 1000  # up or down
@@ -143,20 +146,29 @@ class CameraRefinement(OptimisedEffect):
 
     @classmethod
     @override
-    def look_for(cls, fit: ShortFit) -> Finding | None:
-        """Measure by how much held-out photographs are shifted against their renderings."""
-        if fit.config.model.sh_direction != "mean":
-            return None
+    def look_for(cls, fit: ShortFit) -> list[Finding]:
+        """Measure by how much photographs are moved and distorted against their renderings."""
+        views = (*fit.alignments, *fit.trained)
+        zoom, bend = (_middle([getattr(v, name) for v in views]) for name in ("zoom", "distortion"))
+        skew, other = np.median([np.abs(v.skew) for v in views], axis=0)
         shifts = np.stack([alignment.shift for alignment in fit.alignments])
-        root_mean_square = float(np.sqrt(np.square(shifts).sum(axis=1).mean()))
-        rate = SHORT_FIT_RATE
-        return Finding(
-            "camera refinement",
-            f"photographs are shifted by {root_mean_square * fit.factor:.1f} px",
-            is_likely=root_mean_square > MIN_SHIFT_PX,
-            changes={"cameras.optimise": True},
-            in_short_fits={"cameras.rotation_lr": rate, "cameras.translation_lr": rate},
-        )
+        shift = float(np.sqrt(np.square(shifts).sum(axis=1).mean()))
+        rates = {"cameras.rotation_lr": SHORT_FIT_RATE, "cameras.translation_lr": SHORT_FIT_RATE}
+        poses, focal = {"cameras.optimise": True}, {"cameras.focal_lr": SHORT_FIT_RATE}
+        moved = f"photographs are shifted by {shift * fit.factor:.1f} px"
+        larger = f"renderings' corners are {zoom * fit.factor:.1f} px farther out"
+        bent = f"corners are bent by {bend * fit.factor:.1f} px"
+        sheared = f"rows are sheared by {skew * fit.factor:.1f} px"
+        calibrate = "calibrate the lens" if abs(bend) > MIN_BEND_PX else ""
+        is_rolling = skew > max(MIN_SKEW_PX, 1.5 * other)
+        both = "two poses and shutter: rolling, if it is a video" if is_rolling else ""
+        found = [
+            Finding("camera refinement", moved, shift > MIN_SHIFT_PX, poses, rates),
+            Finding("focal length", larger, abs(zoom) > MIN_ZOOM_PX, poses | focal, rates),
+        ]
+        found = found if fit.config.model.sh_direction == "mean" else []
+        found.append(Finding("distortion", bent, False, {}, advice=calibrate))
+        return [*found, Finding("rolling shutter", sheared, False, {}, advice=both)]
 
     def __init__(self, config: CamerasConfig, num_views: int, extent: float) -> None:
         """num_views: of the training split; extent: world units."""
@@ -289,6 +301,13 @@ class CameraRefinement(OptimisedEffect):
         cameras = cameras_json(self.refined_views(dataset.train), dataset.origin)
         content = {"lens_change": asdict(self.lens_change), **cameras}
         write_json(folder / CAMERAS, content)
+
+
+def _middle(values: Sequence[float]) -> float:
+    """Return the median; 0 unless it is far from 0 for the normal deviation of a single value."""
+    middle = float(np.median(values))
+    deviation = 1.4826 * np.median(np.abs(np.array(values) - middle))
+    return middle if abs(middle) > MIN_DEVIATIONS * deviation else 0.0
 
 
 def _set_sensor(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:

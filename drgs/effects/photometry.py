@@ -14,6 +14,7 @@ camera has none. The background behind a transparent photograph is unchanged.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +27,7 @@ from drgs.config.extensions import EFFECTS
 from drgs.core.errors import UserError
 from drgs.core.files import write_json
 from drgs.core.types import Float, TensorXf
-from drgs.effects.base import SimulatedEffect, as_tensor, entries, opacity_of
+from drgs.effects.base import Finding, ShortFit, SimulatedEffect, as_tensor, entries, opacity_of
 from drgs.effects.colors import ColorConfig
 from drgs.effects.optimised import CenteredEffect
 
@@ -40,6 +41,19 @@ DARKEST = 1e-3  # of colours that f maps; below, and above 1, it is linear
 PHOTOMETRY = "photometry.json"  # vignetting and response of the training views' cameras
 
 COEFFICIENTS = {"vignetting": 3, "response": 2}
+
+EXAMINED_LRS = {"vignetting": 0.03, "response": 0.005}  # where an examination chooses them
+SHORT_FIT_LR, MAX_LOSS_DB = 0.003, 0.5  # in short fits, in which they have no time to settle
+
+EVIDENCE = {
+    "vignetting": ("corners are darker by {:.1%}", (0.004, 0.06)),
+    "response": ("exponents of cameras differ by {:.1%}", (0.02, 0.04)),
+}
+"""Differences of photographs from renderings, which absorb most of them, from which a short fit is
+worth its time; and those of its renderings, which have absorbed less, from which it confirms them.
+"""
+
+MIN_CAMERA_VIEWS = 5  # that show them
 
 
 @EFFECTS.register("photometry")
@@ -58,12 +72,21 @@ class Photometry(CenteredEffect):
 
     @classmethod
     @override
+    def look_for(cls, fit: ShortFit) -> list[Finding]:
+        """Measure how photographs' corners and tones differ, by the middle of each camera's.
+
+        Splats absorb most of it. What they have absorbed shows when a fit has coefficients.
+        """
+        return [found for name in COEFFICIENTS if (found := _finding(name, 0, fit))]
+
+    @classmethod
+    @override
     def from_config(cls, config: FitConfig, dataset: Dataset, section: None) -> Photometry:
         return cls(config.section("colors", ColorConfig), dataset.train)
 
     def __init__(self, config: ColorConfig, views: Sequence[View]) -> None:
         """views: the training split."""
-        keys = [_camera_key(view) for view in views]
+        keys = [camera_key(view) for view in views]
         rows = {key: row for row, key in enumerate(dict.fromkeys(keys))}
         self.camera_rows = [rows[key] for key in keys]  # by view
         if config.response_lr is not None and len(rows) == 1:
@@ -145,7 +168,27 @@ def given_rates(config: ColorConfig) -> dict[str, float]:
     return {name: rate for name, rate in rates.items() if rate is not None}
 
 
-def _camera_key(view: View) -> tuple[object, ...]:
+def camera_key(view: View) -> tuple[object, ...]:
     """Return a key that is the same for photographs by the same camera."""
     size = view.width, view.height
     return *size, view.fx, view.fy, view.cx, view.cy, repr(view.lens)
+
+
+def _finding(name: str, stage: int, fit: ShortFit) -> Finding | None:
+    """Return what the middle of each camera's views shows; None: nothing, or too little at stage 1.
+
+    stage: 0 without the effect, 1 with it.
+    """
+    views, alignments = (*fit.dataset.test, *fit.dataset.train), (*fit.alignments, *fit.trained)
+    cameras: dict[tuple[object, ...], list[float]] = {}
+    for view, alignment in zip(views, alignments, strict=False):
+        cameras.setdefault(camera_key(view), []).append(getattr(alignment, name))
+    middles = [np.median(each) for each in cameras.values() if len(each) >= MIN_CAMERA_VIEWS]
+    if len(middles) < (1 if name == "vignetting" else 2):
+        return None
+    value = float(-np.min(middles) if name == "vignetting" else np.ptp(middles))
+    text, least = EVIDENCE[name]
+    changes, rates = ({f"colors.{name}_lr": lr} for lr in (EXAMINED_LRS[name], SHORT_FIT_LR))
+    likely, confirm = value > least[stage], partial(_finding, name, 1)
+    found = Finding(name, text.format(value), likely, changes, rates, "", confirm, MAX_LOSS_DB)
+    return None if stage and not likely else found

@@ -56,9 +56,12 @@ def run(args: argparse.Namespace) -> None:
         with StepProgress("examining: ") as steps:
             examination = examine(dataset, config, steps.update)
     print(examination)
-    if changes := examination.changes:
+    changes, bad = examination.changes, examination.bad_photographs
+    if changes or bad:
         words = ["drgs", "fit", str(args.config)]
-        chosen = (f"{key}={_yaml_of(value)}" for key, value in changes.items())
+        words += [word for name in bad for word in ("--leave-out", name)]
+        kept = (each for each in changes.items() if each[0] != "data.leave_out")
+        chosen = (f"{key}={_yaml_of(value)}" for key, value in kept)
         for each in (*args.overrides, *chosen):
             words += ["--set", each]
         print(f"fit with it: {shlex.join(words)}")

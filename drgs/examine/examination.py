@@ -9,50 +9,44 @@ photographs are not looked at.
 from __future__ import annotations
 
 import json
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import cast
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from pydantic import ValidationError
-from scipy.special import stdtrit
+from scipy.stats import wilcoxon
 from typing_extensions import override
 
 from drgs.cli.execution import select_variant
-from drgs.config.changes import given_keys, with_changes, with_iterations
+from drgs.config.changes import given_keys, with_changes
 from drgs.config.extensions import EFFECTS, EXAMINERS
 from drgs.config.load import config_from
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError, one_line
-from drgs.datasets.images import smaller_view, with_arrays
-from drgs.datasets.types import Dataset, evenly_spaced
+from drgs.datasets.types import Dataset, View
 from drgs.effects.base import Finding, Progress, ShortFit
+from drgs.effects.photometry import camera_key
+from drgs.examine import short_fits
+from drgs.examine.photographs import look_for_bad_photographs, look_for_moving_things
 from drgs.initialization.defaults import resolve_defaults
-from drgs.initialization.start import Start, gaussians_at, start_of
-from drgs.results.alignment import align
 from drgs.training.finite_checks import NonFiniteError
-from drgs.training.trainer import Trainer
 
-SHORT_FIT_WIDTH_PX = 135  # about: of photographs in short fits
-NUM_GAUSSIANS = 15_000
-SHARE_OF_ITERATIONS, MAX_ITERATIONS, MIN_ITERATIONS = 1 / 6, 500, 250
-"""A short fit has this share of the fit's iterations, within these bounds; a fit that is shorter
-than six times the least is not examined."""
+MIN_VIEWS = 20  # photographs of an examination; with fewer there is none
 
-MAX_VIEWS, MIN_VIEWS = 160, 20  # photographs of an examination; with fewer there is none
-NUM_HELD_OUT, HELD_OUT_STRIDE = 10, (4, 8)
-"""Photographs that are left out, about: one in four to one in eight."""
+MIN_GAIN_DB, CONFIDENCE, TRIMMED = 0.05, 0.99, 0.1
+"""A gain that counts: in itself, and the confidence that gains of held-out photographs are above
+zero, by Wilcoxon's signed ranks without the share of them that is farthest from their middle.
+Leaving these out makes 0.97 of it, for normal gains."""
 
-MIN_GAIN_DB, CONFIDENCE = 0.05, 0.975
-"""A gain that counts: in itself, and the confidence that the mean over held-out photographs is
-above zero, by Student's t."""
+MIN_CAMERA_VIEWS = 8  # held-out, of a camera whose gains alone may count
 
-WARM_UP_ITERATIONS = 20  # of a short fit, whose time does not count: kernels are compiled
+MIN_RESEMBLANCE = 0.6  # of short fits; 0.89 to 0.98, and 0.36 of dark ones that stay blurred
 
 BORDER_PX, BORDER_TOLERANCE, MIN_BORDER_SHARE = 2, 0.04, 0.6
 """A background of one colour: of each photograph's border, this share has it, but for this."""
@@ -64,10 +58,11 @@ class Decision:
 
     effect: str
     evidence: str
-    gain: float | None = None  # dB, mean over the held-out photographs; None: it was not tried
-    spread: float | None = None  # dB: standard error of this mean
+    gain: float | None = None  # dB, middle of held-out photographs; None: it was not tried
+    spread: float | None = None  # dB: standard error of this middle
     cost: float | None = None  # time of iterations, relative to those without the effect
     changes: Mapping[str, object]  # values of the configuration that simulate it, by key
+    advice: str = ""  # where they are not chosen, or there are none
     chosen: bool = False
 
 
@@ -79,6 +74,13 @@ class Examination:
     num_held_out: int  # training photographs
     wall_s: float
     note: str = ""  # why nothing was examined, if so
+    smaller: str = ""  # what there was no time for
+
+    @property
+    def bad_photographs(self) -> list[str]:
+        """Names of photographs that should be left out, chosen or not."""
+        tried = (each.changes for each in self.decisions if each.gain is not None)
+        return [name for changes in tried for name in _left_out(changes)]
 
     @property
     def changes(self) -> dict[str, object]:
@@ -110,15 +112,16 @@ class Examination:
             if one.gain is not None and one.cost is not None:
                 gain, cost = f"{one.gain:+.2f} ± {one.spread:.2f}", f"x {one.cost:.2f}"
             keys = ", ".join(f"{key}: {value}" for key, value in one.changes.items())
-            rows.append((one.effect, one.evidence, gain, cost, keys if one.chosen else "no"))
+            last = keys if one.chosen else one.advice or "no"
+            rows.append((one.effect, one.evidence, gain, cost, last))
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = (
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
             for row in rows
         )
-        return "\n  ".join(
-            [f"examined in {self.wall_s:.0f} s, on {self.num_held_out} held-out views:", *lines]
-        )
+        title = f"examined in {self.wall_s:.0f} s, on {self.num_held_out} held-out views"
+        title += f" (within --budget: {self.smaller}):" if self.smaller else ":"
+        return "\n  ".join([title, *lines])
 
 
 @EXAMINERS.register("short_fits")
@@ -126,72 +129,152 @@ def examine(
     dataset: Dataset,
     config: FitConfig | Mapping[str, object] | None = None,
     progress: Progress | None = None,
+    seconds: float | None = None,
 ) -> Examination:
     """Return which effects the dataset's training photographs need, with the evidence.
 
     config: of the fit, or nested mappings, by default all defaults; effects whose keys it gives are
     not examined. With a fit that is too short, or fewer than 20 training photographs, nothing is
-    examined, and ``note`` says so. Activates the Mitsuba variant ``llvm_ad_rgb`` where none is
-    active.
+    examined, and ``note`` says so. seconds: that the examination may take, which is smaller then,
+    or none. Activates the Mitsuba variant ``llvm_ad_rgb`` where none is active.
 
     Effects look for themselves: ``drgs.effects.base.TrainingEffect.look_for``.
     """
     started = time.perf_counter()
+    end = math.inf if seconds is None else started + seconds
     if not isinstance(config, FitConfig):
         values = dict(config or {})
         values["data"] = {"path": ".", **cast("Mapping[str, object]", values.get("data", {}))}
         config = config_from(values, "examine(): config")
     if note := _reason_not_examined(config, dataset):
         return Examination((), 0, 0.0, note)
-    given, short = given_keys(config), _shorten(resolve_defaults(config, dataset))
-    split, factor = split_views(dataset)
+    given, short = given_keys(config), short_fits.shorten(resolve_defaults(config, dataset))
+    folds, factor = short_fits.split_views(dataset)
     progress = progress or (lambda what, done, total: None)
     if mi.variant() is None:
         select_variant(VARIANTS[0])
-    base = short_fit(short, split, factor, partial(progress, "baseline"))
+    try:
+        short, folds, smaller = short_fits.plan_short_fits(short, folds, end)
+        base = short_fits.fit_folds(short, folds, factor, partial(progress, "baseline"), end, True)
+    except short_fits.OutOfTimeError:
+        note = f"short fits take longer than the {seconds:.0f} s that --budget leaves for them"
+        return Examination((), 0, time.perf_counter() - started, note)
+    if (alike := _resemblance(base)) < MIN_RESEMBLANCE:
+        note = f"short fits have {alike:.0%} of the photographs' variance, too little to compare"
+        return Examination((), 0, time.perf_counter() - started, note)
     decisions = []
     for finding in _findings(base):
         if any(overlaps(key, other) for key in finding.changes for other in given):
             continue
-        if not finding.is_likely:
-            decisions.append(_reject(finding))
-            continue
-        try:
-            changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
-            tried = short_fit(changed, split, factor, partial(progress, finding.effect))
-        except (ValidationError, UserError, NonFiniteError) as error:
-            decisions.append(_reject(finding, f"; could not be tried: {one_line(error, 100)}"))
-            continue
-        decision = decide(finding, base, tried)
+        decision, base = _try(finding, base, folds, partial(progress, finding.effect), end)
         decisions.append(decision)
-        if decision.chosen:  # the next one is tried beside it
-            base = tried
+    num_held_out = sum(len(fold.test) for fold in folds)
     wall_s = time.perf_counter() - started
-    return Examination(tuple(decisions), len(split.test), wall_s)
+    return Examination(tuple(decisions), num_held_out, wall_s, smaller=smaller)
+
+
+def _resemblance(fit: ShortFit) -> float:
+    """Return the middle share of training photographs' variance that aligned renderings explain."""
+    pairs = zip(fit.dataset.train, fit.trained, strict=True)
+    left = [10 ** (-one.toned_psnr / 10) / np.var(np.asarray(view.image)) for view, one in pairs]
+    return float(1 - np.median(left))
+
+
+def _try(
+    finding: Finding,
+    base: ShortFit,
+    folds: Sequence[Dataset],
+    progress: Callable[[int, int], None],
+    end: float,
+) -> tuple[Decision, ShortFit]:
+    """Return the decision about a finding, and the fit beside which the next one is tried."""
+    if not finding.is_likely:
+        return _reject(finding), base
+    try:
+        short_fits.check_time(end - base.wall_s)
+        changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
+        tried = short_fits.fit_folds(changed, folds, base.factor, progress, end)
+    except short_fits.OutOfTimeError:
+        return _reject(finding, "; no time was left to try it"), base
+    except (ValidationError, UserError, NonFiniteError) as error:
+        return _reject(finding, f"; could not be tried: {one_line(error, 100)}"), base
+    confirmed = finding if finding.confirm is None else finding.confirm(tried)
+    if confirmed is None:
+        return _reject(finding, "; a fit with it does not confirm it"), base
+    decision = decide(confirmed, base, tried)
+    return decision, tried if decision.chosen else base
+
+
+def _left_out(changes: Mapping[str, object]) -> list[str]:
+    return cast("list[str]", changes.get("data.leave_out", []))
 
 
 def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
-    """Return the decision about an effect from two short fits: the second one simulates it."""
-    gains = fitted.psnr - without.psnr
-    gain, spread = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains)))
-    return Decision(
-        effect=finding.effect,
-        evidence=finding.evidence,
-        gain=gain,
-        spread=spread,
-        cost=fitted.wall_s / without.wall_s,
-        changes=finding.changes,
-        chosen=gain > max(MIN_GAIN_DB, spread * float(stdtrit(len(gains) - 1, CONFIDENCE))),
+    """Return the decision about an effect from two short fits: the second one simulates it.
+
+    The gain is the median of the mean gains of all pairs of held-out photographs, by ranks (Hodges
+    and Lehmann 1963), which a few that differ do not move, nor do they spread it. It counts where
+    it does over all photographs, or over those of one camera while others do not lose.
+    """
+    pairs = (without.psnr, fitted.psnr)
+    if finding.max_loss is not None:  # renderings of held-out views have no vignetting
+        pairs = (without.toned_psnr, fitted.toned_psnr)
+    before, after = (
+        {view.name: psnr for view, psnr in zip(fit.dataset.test, values, strict=True)}
+        for fit, values in zip((without, fitted), pairs, strict=True)
     )
+    kept = before.keys() - {*fitted.config.data.leave_out}
+    views = [view for view in fitted.dataset.test if view.name in kept]
+    gains = np.array([after[view.name] - before[view.name] for view in views])
+    keys = [camera_key(view) for view in views]
+    cameras = [np.array([key == other for other in keys]) for key in dict.fromkeys(keys)]
+    cameras = [of_camera for of_camera in cameras if of_camera.sum() >= MIN_CAMERA_VIEWS]
+    gain, spread = middle_of(gains)
+    if finding.max_loss is not None:
+        chosen = gain > -finding.max_loss
+    else:
+        alone = any(_counts(gains[each], 1 - (1 - CONFIDENCE) / len(cameras)) for each in cameras)
+        agree = all(middle_of(gains[each])[0] > -MIN_GAIN_DB for each in cameras)
+        chosen = _counts(gains, CONFIDENCE) or (alone and agree)
+    cost = fitted.wall_s / without.wall_s
+    return replace(_reject(finding), gain=gain, spread=spread, cost=cost, chosen=chosen)
+
+
+def middle_of(gains: np.ndarray) -> tuple[float, float]:
+    """Return Hodges and Lehmann's estimate of the gains' middle, and its standard error.
+
+    The error is that of the normal distribution which has its interval of ranks.
+    """
+    count = len(gains)
+    rows, columns = np.triu_indices(count)
+    means = np.sort((gains[rows] + gains[columns]) / 2)
+    off = np.sqrt(count * (count + 1) * (2 * count + 1) / 24)  # of the ranks' sum
+    ends = np.clip(len(means) / 2 + off * np.array([-1, 1]), 0, len(means) - 1).round().astype(int)
+    return float(np.median(means)), float(np.diff(means[ends])[0] / 2)
+
+
+def _counts(gains: np.ndarray, confidence: float) -> bool:
+    middle, _ = middle_of(gains)
+    order = np.argsort(np.abs(gains - middle), kind="stable")
+    kept = gains[order[: len(gains) - int(TRIMMED * len(gains))]]
+    if middle <= MIN_GAIN_DB:  # ranks of zeros have no deviation
+        return False
+    _, chance = cast("tuple[float, float]", wilcoxon(kept, alternative="greater"))
+    return bool(chance <= 1 - confidence)
 
 
 def _reject(finding: Finding, reason: str = "") -> Decision:
-    evidence = finding.evidence + reason
-    return Decision(effect=finding.effect, evidence=evidence, changes=finding.changes)
+    effect, evidence = finding.effect, finding.evidence + reason
+    return Decision(
+        effect=effect, evidence=evidence, changes=finding.changes, advice=finding.advice
+    )
 
 
 def _reason_not_examined(config: FitConfig, dataset: Dataset) -> str:
-    count, least = len(dataset.train), round(MIN_ITERATIONS / SHARE_OF_ITERATIONS)
+    count, least = (
+        len(dataset.train),
+        round(short_fits.MIN_ITERATIONS / short_fits.SHARE_OF_ITERATIONS),
+    )
     if count < MIN_VIEWS:
         return f"{count} training photographs are fewer than {MIN_VIEWS}"
     if config.iterations < least:
@@ -204,95 +287,47 @@ def overlaps(key: str, other: str) -> bool:
     return f"{key}.".startswith(f"{other}.") or f"{other}.".startswith(f"{key}.")
 
 
-# Short fits
-
-
-def split_views(dataset: Dataset) -> tuple[Dataset, int]:
-    """Return the training photographs, small, with some left out as ``test``, and their divisor."""
-    views = evenly_spaced(dataset.train, MAX_VIEWS)
-    factor = max(1, round(max(view.width for view in views) / SHORT_FIT_WIDTH_PX))
-    stride = int(np.clip(len(views) // NUM_HELD_OUT, *HELD_OUT_STRIDE))
-    small = [with_arrays(smaller_view(view, factor)) for view in views]
-    held_out = range(stride // 2, len(small), stride)
-    train = tuple(view for index, view in enumerate(small) if index not in held_out)
-    test = [small[index] for index in held_out]
-    test = tuple(view for view in test if view.mask is None or np.any(view.mask))
-    return replace(dataset, train=train, test=test), factor
-
-
-def short_fit(
-    config: FitConfig, split: Dataset, factor: int, progress: Callable[[int, int], None]
-) -> ShortFit:
-    """Fit the training views of ``split``, and render its test views; config: of a short fit."""
-    split = with_background(split, config)
-    config = resolve_defaults(config, split)
-    trainer = Trainer(config, split, gaussians_at(_fewer(start_of(config, split)), config))
-    started = time.perf_counter()
-    while trainer.iteration < config.iterations:
-        trainer.step()
-        progress(trainer.iteration, config.iterations)
-        if trainer.iteration == WARM_UP_ITERATIONS:
-            dr.sync_thread()
-            started = time.perf_counter()
-    trainer.check()  # waits for the device
-    wall_s = time.perf_counter() - started
-    images = [np.asarray(image)[..., :3] for image in trainer.images(split.test)]
-    pairs = zip(split.test, images, strict=True)
-    alignments = [align(view, image, split.background) for view, image in pairs]
-    gaussians = trainer.gaussians()
-    trainer.release()
-    return ShortFit(config, split, gaussians, images, alignments, factor, wall_s)
-
-
-def _fewer(start: Start) -> Start:
-    """Return at most as many points as a short fit has Gaussians."""
-    every = -(-len(start.means) // NUM_GAUSSIANS)
-    colors = None if start.colors is None else start.colors[::every]
-    return replace(start, means=start.means[::every], colors=colors)
-
-
-def _shorten(config: FitConfig) -> FitConfig:
-    iterations = min(MAX_ITERATIONS, round(SHARE_OF_ITERATIONS * config.iterations))
-    goal = getattr(config.densify.settings, "gaussians", None) or NUM_GAUSSIANS
-    changes = {
-        "densify.strategy": "budget",
-        "densify.budget.gaussians": min(goal, NUM_GAUSSIANS),
-        "densify.prune.to": None,
-        "init.num_points": None,
-        "coarse": None,
-        "optimizer.views_per_step": 1,
-    }
-    return with_changes(with_iterations(config, iterations), changes)
-
-
-def with_background(dataset: Dataset, config: FitConfig) -> Dataset:
-    """Return the dataset with the configured background behind opaque photographs."""
-    if any(view.alpha is not None for view in dataset.train) or config.data.background is None:
-        return dataset
-    return replace(dataset, background=config.data.background_rgb)
-
-
 # Findings
 
 
-def _findings(fit: ShortFit) -> list[Finding]:
-    """Return the findings of what is shipped and of installed extensions."""
+def _findings(fit: ShortFit) -> Iterator[Finding]:
+    """Yield the findings of what is shipped and of installed extensions."""
     effects = sorted((extension.value for extension in EFFECTS.all()), key=lambda e: e.order)
-    found = [look(fit) for look in (_look_for_background, *(e.look_for for e in effects))]
-    return [finding for finding in found if finding is not None]
+    looks = [_look_for_background, look_for_bad_photographs, *(e.look_for for e in effects)]
+    _, share = _border_colors((*fit.dataset.train, *fit.dataset.test))
+    for look in (*looks, look_for_moving_things):
+        found = look(fit)
+        for one in [found] if isinstance(found, Finding) else found or ():
+            if one.effect == "vignetting" and one.is_likely and share >= MIN_BORDER_SHARE:
+                text = f"{one.evidence}, as before another background; photograph a wall to tell"
+                yield replace(one, evidence=text, is_likely=False)
+            else:
+                yield one
+
+
+def _border_colors(views: Sequence[View]) -> tuple[np.ndarray, float]:
+    """Return the colours (V, 3) of opaque photographs' borders, and which share of them is alike.
+
+    Photographs with transparency or masks have none.
+    """
+    if any(view.alpha is not None or view.mask is not None for view in views):
+        return np.empty((0, 3)), 0.0
+    borders = [_border(np.asarray(view.image)) for view in views]
+    colors = np.array([np.median(border, axis=0) for border in borders])
+    deviations = [border - color for border, color in zip(borders, colors, strict=True)]
+    alike = (np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1)
+    return colors, float(alike.mean())
 
 
 def _look_for_background(fit: ShortFit) -> Finding | None:
     """Compare each pixel at the border of opaque photographs with the median of its border."""
-    views = (*fit.dataset.train, *fit.dataset.test)
-    if any(view.alpha is not None or view.mask is not None for view in views):
+    colors, share = _border_colors((*fit.dataset.train, *fit.dataset.test))
+    if not len(colors):
         return None
-    borders = [_border(np.asarray(view.image)) for view in views]
-    colors = [np.median(border, axis=0) for border in borders]
-    deviations = [border - color for border, color in zip(borders, colors, strict=True)]
-    share = float((np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1).mean())
     color = np.median(colors, axis=0)
-    is_other = np.abs(color - fit.config.data.background_rgb).max() > BORDER_TOLERANCE
+    spread = np.median(np.abs(colors - color), axis=0)  # by exposure
+    other = np.abs(color - fit.config.data.background_rgb) - 3 * spread
+    is_other = other.max() > BORDER_TOLERANCE
     background = tuple(round(float(value), 3) for value in color)
     shown = ", ".join(f"{value:.2f}" for value in background)
     return Finding(

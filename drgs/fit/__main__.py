@@ -35,7 +35,7 @@ from drgs.training.parallel.communicator import Communicator
 if TYPE_CHECKING:  # imported with --view
     from drgs.live_page.server import LocalServer
 
-MIN_EXAMINED_SECONDS = 100  # of a --budget: an examination takes 8 to 25 s
+MIN_EXAMINED_SECONDS = 100  # of a --budget: no short fit ends within a tenth of less
 
 LOADING_SECONDS = 1.2  # before run(), for imports; --budget includes them
 

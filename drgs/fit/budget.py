@@ -52,6 +52,8 @@ WARM_UP_ITERATIONS, MIN_TIMED_ITERATIONS, REHEARSAL_VIEWS = 6, 20, 8
 
 REHEARSAL_SHARE, MAX_REHEARSAL_S = 0.03, 10.0  # of the time: what a rehearsal may take, at most
 
+EXAMINATION_SHARE = 0.1  # of the time: what an examination of the photographs may take
+
 NEVER = 1_000_000_000  # an iteration after all
 
 MAX_IMAGES_SHARE = 0.33
@@ -71,6 +73,11 @@ class Budget:
     def rehearsal_s(self) -> float:
         """Seconds of a rehearsal."""
         return min(REHEARSAL_SHARE * self.seconds, MAX_REHEARSAL_S)
+
+    @property
+    def examination_s(self) -> float:
+        """Seconds of an examination, from now."""
+        return max(0.0, min(EXAMINATION_SHARE * self.seconds, self.end - time.perf_counter()))
 
 
 @dataclass(frozen=True)

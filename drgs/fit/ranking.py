@@ -87,14 +87,8 @@ def _hint_at(
         hints.append(f"exposure or white balance (red, green, blue {gains})")
     if (shift := float(np.hypot(*found.shift))) > MIN_SHIFT_PX:
         hints.append(f"pose (off by {shift * factor:.1f} px)")
-    if _mean_step(np.asarray(view.image)) < MAX_SHARPNESS * _mean_step(image):
+    if found.sharpness < np.log(MAX_SHARPNESS):
         hints.append("blurred")
     if not hints and is_outlier:
         hints.append("something moved, or is seen here alone")
     return "; ".join(hints)
-
-
-def _mean_step(image: np.ndarray) -> float:
-    """Return the mean absolute difference of neighbouring pixels."""
-    steps = [np.abs(np.diff(image, axis=axis)).ravel() for axis in (0, 1)]
-    return float(np.concatenate(steps, dtype=np.float64).sum() / max(1, image.size))

@@ -210,13 +210,17 @@ class FitSession:
             return
         examine: Examiner = EXAMINERS.get(names[0]).value
         with StepProgress("examining: ") if self.uses_terminal else nullcontext() as steps:
-            self.examination = examine(dataset, given, None if steps is None else steps.update)
+            update = None if steps is None else steps.update
+            seconds = None if self.budget is None else self.budget.examination_s
+            self.examination = examine(dataset, given, update, seconds)
         self._print(str(self.examination))
         changes = self.examination.changes
         if changes:
             given = with_changes(given, changes)
-        if "data.background" in changes:
+        if any(key.startswith("data.") for key in changes):
             self.dataset = load_dataset(given.data_for_training, sections=given.sections)
+            if self.folder is not None:
+                self._fingerprint = fingerprint_of(self.dataset)
         self.config = resolve_defaults(given, self._inputs[1])
 
     def _plan(self, gaussians: Gaussians, budget: Budget) -> Plan | None:

@@ -8,7 +8,12 @@ it to first order by
 with gains g of the channels c, a shift (u, v), a zoom z and a rotation w about the middle of the
 image. :func:`align` finds the seven numbers by least squares, again after moving the rendering by
 them (Lucas and Kanade 1981), with weights by which pixels with other differences count little
-(Cauchy's, Holland and Welsch 1977).
+(Cauchy's, Holland and Welsch 1977). What is left, it regresses on
+
+    (a s + p log r) r + b (x s dr/dx + y s dr/dy) + y (m dr/dx + n dr/dy), s = x^2 + y^2,
+
+with the vignetting a, the response r^exp(p), the distortion b and the skews m, n of rows that are
+read one after the other.
 """
 
 from __future__ import annotations
@@ -24,7 +29,9 @@ SIGMA_PX = 1.0  # of the blur before the derivatives, so that they hold for shif
 NUM_MOVES, NUM_REWEIGHTINGS = 4, 4
 MIN_SIDE_PX = 8  # of an image; smaller ones are not aligned
 MIN_COVERED = 0.5  # share of the image; a rendering that is moved farther is not aligned
+MAX_MOVE = 0.25  # of corners, half diagonals: farther ones are found where nothing is alike
 MIN_DEVIATION = 1e-6  # of the remaining differences, display space
+DARKEST = 0.02  # of colours whose logarithm is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +41,14 @@ class Alignment:
     gains: np.ndarray  # (3,): the photograph's brightness relative to the rendering's, minus 1
     shift: np.ndarray  # (2,) px: from the rendering's content to the photograph's
     psnr: float  # dB, of the rendering without these differences
+    toned_psnr: float  # dB, also without vignetting and response
+    vignetting: float  # brightness of corners relative to the middle's, minus 1
+    response: float  # logarithm of the exponent by which the photograph's colours differ
+    zoom: float  # px at half the diagonal
+    distortion: float  # px at half the diagonal, beyond the zoom
+    skew: np.ndarray  # (2,) px at half the diagonal: shift of lower rows
+    sharpness: float  # logarithm of the photograph's steps between pixels over the rendering's
+    left: np.ndarray  # (H, W) float32: RMS difference of each pixel that remains, masked ones 0
 
 
 def align(
@@ -63,16 +78,48 @@ def align(
         numbers = _fit_numbers(directions, blurred - smooth, counts)
         gains, moved = numbers[:3], moved + numbers[3:]
     at, is_covered = _move(image, moved)
-    error = _mean_error(photograph - at - gains * (at - behind), counts * is_covered)
-    if is_covered.mean() < MIN_COVERED or not error < before:
-        gains, moved, error = np.zeros(3), np.zeros(4), before
-    return Alignment(gains, moved[:2], -10 * float(np.log10(max(error, 1e-10))))
+    seen, left, others = counts * is_covered, photograph - at - gains * (at - behind), np.zeros(8)
+    error = toned = _mean_error(left, seen)
+    if min(height, width) >= MIN_SIDE_PX:
+        base = (1 + gains) * (at - behind)
+        smooth = ndimage.gaussian_filter(left, blur)
+        others = _fit_numbers(_other_directions(base, at, blur), smooth, seen)
+        further = left - _other_directions(base, at, (0, 0, 0))[..., :3] @ others[:3]
+        if (after := _mean_error(further, seen)) < error:
+            left, toned = further, after
+    farthest = max(np.abs(moved).max(), np.abs(others[3:]).max()) / (np.hypot(width, height) / 2)
+    if is_covered.mean() < MIN_COVERED or farthest > MAX_MOVE or not toned < before:
+        gains, moved, others = np.zeros(3), np.zeros(4), np.zeros(8)
+        at, seen, left, error, toned = image, counts, photograph - image, before, before
+    return Alignment(
+        gains=gains,
+        shift=moved[:2],
+        psnr=-10 * float(np.log10(max(min(error, before), 1e-10))),
+        toned_psnr=-10 * float(np.log10(max(toned, 1e-10))),
+        vignetting=float(others[1]),
+        response=float(others[2]),
+        zoom=float(moved[2] + others[3]),
+        distortion=float(others[4]),
+        skew=others[5:7],
+        sharpness=float(np.log(_mean_step(photograph, seen) / _mean_step(at, seen))),
+        left=(np.sqrt(np.square(left).mean(axis=2)) * seen).astype(np.float32),
+    )
 
 
 def _mean_error(difference: np.ndarray, counts: np.ndarray) -> float:
     """Return the mean square of differences (H, W, 3); counts: weights (H, W)."""
     squares = np.square(difference).mean(axis=2)
     return float((squares * counts).sum() / max(counts.sum(), 1e-10))
+
+
+def _mean_step(image: np.ndarray, counts: np.ndarray) -> float:
+    """Return the mean absolute difference of neighbouring pixels (H, W, 3) that count."""
+    steps = [np.diff(image, axis=axis) for axis in (0, 1)]
+    both = [np.minimum(counts[1:], counts[:-1]), np.minimum(counts[:, 1:], counts[:, :-1])]
+    sums = [
+        (np.abs(step).mean(axis=2) * each).sum() for step, each in zip(steps, both, strict=True)
+    ]
+    return float(sum(sums) / max(counts.sum(), 1) + MIN_DEVIATION)
 
 
 def _coordinates(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -109,6 +156,23 @@ def _directions(image: np.ndarray, base: np.ndarray) -> np.ndarray:
     gains = base[..., None] * np.eye(image.shape[2])
     others = np.stack([dx, dy, x * dx + y * dy, x * dy - y * dx], axis=-1)
     return np.concatenate([gains, others], axis=-1)
+
+
+def _other_directions(
+    base: np.ndarray, image: np.ndarray, blur: tuple[float, float, float]
+) -> np.ndarray:
+    """Return derivatives (H, W, 3, 8).
+
+    They are along gain, vignetting, response, zoom, distortion, two skews, and a rotation, which
+    has explained a part of the skews.
+    """
+    x, y = (each[..., None] for each in _coordinates(*base.shape[:2]))
+    s, tones = x * x + y * y, np.log(np.clip(image, DARKEST, 1))
+    gains = [ndimage.gaussian_filter(base * each, blur) for each in (np.ones_like(s), s, tones)]
+    dy, dx = np.gradient(ndimage.gaussian_filter(image, blur), axis=(0, 1))
+    outward = x * dx + y * dy
+    numbers = [*gains, outward, s * outward, y * dx, y * dy, x * dy - y * dx]
+    return np.stack(numbers, axis=-1)
 
 
 def _fit_numbers(directions: np.ndarray, difference: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 from support.commands import assert_ends_well, assert_refused
 from support.fit_command import assert_fit_refused, assert_fits, without_images
-from support.small_capture import blobs, make_dataset, photograph, write_dataset
+from support.small_capture import blobs, make_dataset, photograph, pose_around, view, write_dataset
 
 import drgs
 from drgs.config.extensions import EFFECTS
@@ -22,10 +22,13 @@ from drgs.core.registry import temporary_registrations
 from drgs.effects.base import Finding, TrainingEffect
 from drgs.effects.colors import exposure_spread
 from drgs.examine import __main__ as command
-from drgs.examine.examination import Examination, decide, given_keys, overlaps, split_views
+from drgs.examine.examination import Examination, decide, given_keys, middle_of, overlaps
+from drgs.examine.short_fits import split_views
 
 ITERATIONS = 1500  # of a fit: the fewest that are examined
-NAMES = ["background of one colour", "exposure and white balance", "camera refinement"]
+NAMES = ["background of one colour", "bad photographs", "exposure and white balance"]
+NAMES += ["vignetting", "camera refinement", "focal length", "distortion", "rolling shutter"]
+NAMES += ["things that move"]
 assert_examines = partial(assert_ends_well, command.main)
 
 
@@ -77,10 +80,28 @@ def test_what_photographs_call_for_is_chosen_and_nothing_else(dataset, case):
     found = drgs.examine(spoil(dataset, change), config_of())
     assert found.changes == chosen, str(found)
     assert [each.effect for each in found.decisions] == NAMES
-    assert found.num_held_out == 10
+    assert found.num_held_out == 20
     again = drgs.examine(spoil(dataset, change), config_of())
     for one, other in zip(found.decisions, again.decisions, strict=True):
         assert replace(one, cost=None) == replace(other, cost=None)
+
+
+def near_and_far():
+    """39 near photographs and 3 far ones, each with the exposure that its mean calls for."""
+    scene, rng, views = blobs(), np.random.default_rng(2), []
+    for k in range(42):
+        turn, height = 2.4 * k, rng.uniform(0.1, 1.0)
+        pose = pose_around(turn, height, 11.0 if k % 14 == 6 else rng.uniform(2.2, 4.0))
+        image = photograph(scene, view(f"{k:02d}", pose, None), (0.25, 0.25, 0.25)).image
+        image = np.clip(image * (0.4 / image.mean()), 0, 1)
+        views.append(view(f"{k:02d}", pose, image.astype(np.float32)))
+    return replace(make_dataset(), train=tuple(views), background=(0.25, 0.25, 0.25))
+
+
+@pytest.mark.slow
+def test_automatic_exposure_is_found_although_some_photographs_are_far():
+    found = drgs.examine(near_and_far(), config_of())
+    assert found.changes.get("colors.lr") == 0.02, str(found)
 
 
 @pytest.mark.slow
@@ -109,11 +130,13 @@ def test_given_values_are_not_examined_and_effects_from_outside_are(dataset):
 
         given = {"colors": {"lr": 0.02}, "cameras": {"optimise": False}}
         found = drgs.examine(dataset, config_of(**given))
-        background, mine = sorted(found.decisions, key=lambda each: each.effect)
+        background, mine = (
+            next(e for e in found.decisions if e.effect == name) for name in (NAMES[0], "mine")
+        )
         assert (background.effect, background.gain) == (NAMES[0], None)
         assert (mine.effect, mine.gain, mine.chosen) == ("mine", 0.0, False)
         found = drgs.examine(dataset, config_of(**given, mine=None))
-        assert [each.effect for each in found.decisions] == NAMES[:1]
+        assert [each.effect for each in found.decisions] == [*NAMES[:2], *NAMES[3:4], *NAMES[6:]]
 
 
 @pytest.mark.parametrize(
@@ -160,39 +183,90 @@ def test_large_photographs_are_scaled_and_masked_ones_not_held_out():
         for view in given.train
     ]
     large[2] = replace(large[2], mask=np.zeros((480, 640), np.float32))
-    split, factor = split_views(replace(given, train=tuple(large)))
+    (split, *_), factor = split_views(replace(given, train=tuple(large)))
     assert (factor, split.train[0].width, len(split.test), len(split.train)) == (5, 128, 9, 30)
     assert all(view.mask is None for view in split.test)
 
 
-def test_each_photograph_is_fitted_or_held_out():
-    given = make_dataset(100, 3)
-    split, factor = split_views(given)
-    held_out = [view.name for view in split.test]
-    assert factor == 1 and len(held_out) == 12 and len(split.train) == 88
-    assert {*held_out} | {view.name for view in split.train} == {v.name for v in given.train}
+@pytest.mark.parametrize(
+    ("count", "held_out"), [(20, [5] * 4), (27, [7, 6, 7]), (42, [10, 10]), (100, [12])]
+)
+def test_each_photograph_is_fitted_or_held_out(count, held_out):
+    given = make_dataset(count, 3)
+    folds, factor = split_views(given)
+    assert factor == 1 and [len(fold.test) for fold in folds] == held_out
+    names = [view.name for fold in folds for view in fold.test]
+    assert len(names) == len({*names})
+    for fold in folds:
+        together = [view.name for view in (*fold.train, *fold.test)]
+        assert {*together} == {view.name for view in given.train} and len(together) == count
+
+
+def fits_with_gains(gains, cameras=None):
+    """Two short fits, as far as decisions are concerned; cameras: a number for each view."""
+    views = make_dataset(len(gains)).train
+    cameras = cameras or [0] * len(views)
+    views = tuple(replace(v, fx=v.fx + number) for v, number in zip(views, cameras, strict=True))
+    before = np.linspace(20, 30, len(gains))
+    dataset = SimpleNamespace(test=views)
+    config = SimpleNamespace(data=SimpleNamespace(leave_out=[]))
+    without = SimpleNamespace(dataset=dataset, psnr=before, wall_s=2.0)
+    psnr = before + gains
+    return without, SimpleNamespace(config=config, dataset=dataset, psnr=psnr, wall_s=3.0)
+
+
+FINDING = Finding("x", "seen", True, {"colors.lr": 0.02})
+OUTLIER = [0.08, 0.12, 0.1, 0.15, 0.11, 0.09, 0.13, 0.1, 0.07, 1.4]
 
 
 @pytest.mark.parametrize(
     ("gains", "chosen"),
     [
-        ((0.3, 0.4, 0.3), True),
-        ((0.3, 0.4, 0.1), False),  # 3.0 standard errors: 4.3 are needed for three
-        ((0.3, -0.2, 0.1), False),
-        ((0.04, 0.041, 0.04), False),
+        ([0.3, 0.4, 0.35, 0.3, 0.4, 0.2, 0.25], True),
+        ([0.3, 0.4, 0.35, 0.3, 0.4, 0.2], False),  # six have the confidence 1 - 1/64
+        (OUTLIER, True),
+        ([*OUTLIER[:-1], -1.4], True),
+        ([0.3, -0.2, 0.1, 0.3, -0.4, 0.2, -0.1, 0.1], False),
+        ([0.04] * 10, False),
+        ([0.0] * 10, False),
     ],
 )
-def test_a_gain_counts_if_it_exceeds_its_spread(gains, chosen):
-    before = SimpleNamespace(psnr=np.array([20.0, 25.0, 30.0]), wall_s=2.0)
-    after = SimpleNamespace(psnr=before.psnr + gains, wall_s=3.0)
-    decision = decide(Finding("x", "seen", True, {"colors.lr": 0.02}), before, after)
+def test_a_gain_counts_if_photographs_agree(gains, chosen):
+    decision = decide(FINDING, *fits_with_gains(np.array(gains)))
     assert decision.chosen is chosen and decision.cost == 1.5
-    assert decision.gain == pytest.approx(np.mean(gains))
-    deviations = np.array(gains) - np.mean(gains)
-    assert decision.spread == pytest.approx(np.sqrt((deviations**2).sum() / 2 / 3))
+    # Pair by pair, each photograph with itself as well.
+    means = [(a + b) / 2 for i, a in enumerate(gains) for b in gains[i:]]
+    assert decision.gain == pytest.approx(np.median(means))
     examination = Examination((decision,), 3, 9.0)
     assert examination.changes == ({"colors.lr": 0.02} if chosen else {})
     assert json.loads(examination.to_json())["changes"] == examination.changes
+
+
+def test_one_far_photograph_spreads_a_mean_and_not_the_ranks():
+    gains = np.array(OUTLIER)
+    assert gains.mean() < 2.26 * gains.std(ddof=1) / np.sqrt(10)  # Student's t, 9 degrees
+    gain, spread = middle_of(gains)
+    assert 0.08 < gain < 0.13 and spread < 0.03
+
+
+def test_the_spread_of_normal_gains_is_their_standard_error():
+    gains = np.random.default_rng(0).normal(0.2, 0.1, (300, 20))
+    middles, spreads = np.array([middle_of(row) for row in gains]).T
+    assert np.mean(spreads) == pytest.approx(np.std(middles), rel=0.1)
+
+
+def test_noise_counts_as_rarely_as_the_confidence_says():
+    gains = np.random.default_rng(0).normal(0.0, 1.0, (1500, 12))
+    share = np.mean([decide(FINDING, *fits_with_gains(row)).chosen for row in gains])
+    assert 0.01 < share < 0.04  # the trimming makes 0.025 of 0.01
+
+
+@pytest.mark.parametrize(("others", "chosen"), [(0.0, True), (-0.2, False)])
+def test_one_of_several_cameras_may_need_an_effect(others, chosen):
+    rng = np.random.default_rng(0)
+    gains = np.concatenate([np.full(8, 0.4), np.full(12, others)]) + rng.normal(0, 0.03, 20)
+    assert decide(FINDING, *fits_with_gains(gains, [1] * 8 + [2] * 12)).chosen is chosen
+    assert not decide(FINDING, *fits_with_gains(gains[8:])).chosen
 
 
 def write_photograph(path, time=None):
@@ -248,7 +322,7 @@ def test_a_fit_of_a_folder_chooses_says_why_and_asks_once(folder):
     points = [(f / "point_cloud.ply").read_bytes() for f in (out, folder / "again")]
     assert points[0] == points[1]
     printed = assert_examines(data, *SETTINGS).stdout
-    assert re.search(r"examined in \d+ s, on 10 held-out views:", printed)
+    assert re.search(r"examined in \d+ s, on 20 held-out views:", printed)
     assert re.search(rf"fit with it: drgs fit {data} .* --set colors\.lr=0\.02\n", printed)
     message = "already holds another run, "
     other = (*SETTINGS, "--set", "colors.lr=0.05")

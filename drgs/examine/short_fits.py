@@ -1,0 +1,199 @@
+"""Short fits to small photographs, of which some are left out, within a given time."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import repeat
+
+import drjit as dr
+import numpy as np
+
+from drgs.config.changes import with_changes, with_iterations
+from drgs.config.schema import FitConfig
+from drgs.datasets.images import smaller_view, with_arrays
+from drgs.datasets.types import Dataset, evenly_spaced
+from drgs.effects.base import ShortFit
+from drgs.initialization.defaults import resolve_defaults
+from drgs.initialization.start import Start, gaussians_at, start_of
+from drgs.results.alignment import align
+from drgs.training.trainer import Trainer
+
+SHORT_FIT_WIDTH_PX = 135  # about: of photographs in short fits
+NUM_GAUSSIANS = 15_000
+SHARE_OF_ITERATIONS, MAX_ITERATIONS, MIN_ITERATIONS = 1 / 6, 500, 250
+"""A short fit has this share of the fit's iterations, within these bounds; a fit that is shorter
+than six times the least is not examined."""
+
+MIN_ITERATIONS_OF_FIT = round(MIN_ITERATIONS / SHARE_OF_ITERATIONS)
+
+MAX_VIEWS = 160  # photographs of an examination
+NUM_HELD_OUT, HELD_OUT_STRIDE, FEW_HELD_OUT = 10, (4, 8), 20
+"""Photographs that are left out, about: one in four to one in eight. Below 50 photographs, so many
+folds leave out others that there are 20: of 20 photographs, each is left out once."""
+
+WARM_UP_ITERATIONS = 20  # of a short fit, whose time does not count: kernels are compiled
+
+TIMED_ITERATIONS, GROWTH, NUM_FITS = 10, 1.6, 2
+"""A plan for a given time: iterations that are timed; the time of later ones and of renderings,
+relative to these; and fits for which there must be time: with an effect and without."""
+
+
+class OutOfTimeError(Exception):
+    """The time of an examination is over."""
+
+
+def check_time(end: float) -> None:
+    """Raise :class:`OutOfTimeError` after ``end``, by ``time.perf_counter``."""
+    if time.perf_counter() > end:
+        raise OutOfTimeError
+
+
+def plan_short_fits(
+    config: FitConfig, folds: Sequence[Dataset], end: float
+) -> tuple[FitConfig, Sequence[Dataset], str]:
+    """Return iterations and folds for which there is time, and what was made smaller.
+
+    config: of a short fit. Raises :class:`OutOfTimeError` if there is no time for the least.
+    """
+    if end == math.inf:
+        return config, folds, ""
+    trainer, started = _make_trainer(config, folds[0]), 0.0
+    for done in range(WARM_UP_ITERATIONS + TIMED_ITERATIONS):
+        check_time(end)
+        if done == WARM_UP_ITERATIONS:
+            dr.sync_thread()
+            started = time.perf_counter()
+        trainer.step()
+    trainer.check()
+    now = time.perf_counter()
+    trainer.release()
+    possible = int((end - now) / NUM_FITS / GROWTH / (now - started) * TIMED_ITERATIONS)
+    iterations, count = min(possible, config.iterations), max(1, possible // config.iterations)
+    if possible < MIN_ITERATIONS:
+        raise OutOfTimeError
+    if iterations == config.iterations and count >= len(folds):
+        return config, folds, ""
+    text = f"{iterations} of {config.iterations} iterations, {min(count, len(folds))} folds"
+    return with_iterations(config, iterations), folds[:count], text
+
+
+def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
+    """Return folds of the training photographs, small, and their divisor.
+
+    ``test`` of each fold are photographs that it leaves out; the first fold alone, unless
+    photographs are few.
+    """
+    views = evenly_spaced(dataset.train, MAX_VIEWS)
+    factor = max(1, round(max(view.width for view in views) / SHORT_FIT_WIDTH_PX))
+    stride = int(np.clip(len(views) // NUM_HELD_OUT, *HELD_OUT_STRIDE))
+    small = [with_arrays(smaller_view(view, factor)) for view in views]
+    num_folds = 1
+    if stride == HELD_OUT_STRIDE[0]:
+        num_folds = min(stride, -(-FEW_HELD_OUT * stride // len(views)))
+    folds = []
+    for first in np.roll(np.arange(stride), -(stride // 2))[:num_folds]:
+        train = tuple(view for index, view in enumerate(small) if index % stride != first)
+        test = tuple(v for v in small[first::stride] if v.mask is None or np.any(v.mask))
+        folds.append(replace(dataset, train=train, test=test))
+    return folds, factor
+
+
+def fit_folds(
+    config: FitConfig,
+    folds: Sequence[Dataset],
+    factor: int,
+    progress: Callable[[int, int], None],
+    end: float = math.inf,
+    with_trained: bool = False,
+) -> ShortFit:
+    """Fit the training views of each fold, and render its test views; config: of a short fit.
+
+    Photographs that it leaves out are fitted in no fold, and tested in the first. with_trained:
+    render the training views of the first fold as well.
+
+    Raises :class:`OutOfTimeError` after ``end``, by ``time.perf_counter``.
+    """
+    left_out, fits = {*config.data.leave_out}, []
+    for number, fold in enumerate(folds):
+        train = tuple(view for view in fold.train if view.name not in left_out)
+        others = () if number else tuple(view for view in fold.train if view.name in left_out)
+        split = replace(fold, train=train, test=(*fold.test, *others))
+
+        def step(done: int, before: int = number * config.iterations) -> None:
+            progress(before + done, config.iterations * len(folds))
+            check_time(end)
+
+        fits.append(_short_fit(config, split, factor, step, with_trained and number == 0))
+    return replace(
+        fits[0],
+        dataset=replace(fits[0].dataset, test=tuple(v for fit in fits for v in fit.dataset.test)),
+        images=[image for fit in fits for image in fit.images],
+        alignments=[alignment for fit in fits for alignment in fit.alignments],
+        wall_s=sum(fit.wall_s for fit in fits),
+    )
+
+
+def _short_fit(
+    config: FitConfig,
+    split: Dataset,
+    factor: int,
+    after_step: Callable[[int], None],
+    with_trained: bool,
+) -> ShortFit:
+    split = with_background(split, config)
+    trainer = _make_trainer(config, split)
+    started = time.perf_counter()
+    while trainer.iteration < config.iterations:
+        trainer.step()
+        after_step(trainer.iteration)
+        if trainer.iteration == WARM_UP_ITERATIONS:
+            dr.sync_thread()
+            started = time.perf_counter()
+    trainer.check()  # waits for the device
+    wall_s, count = time.perf_counter() - started, len(split.test)
+    views = (*split.test, *split.train) if with_trained else split.test
+    images = [np.asarray(image)[..., :3] for image in trainer.images(views)]
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(align, views, images, repeat(split.background)))
+    tested, trained = (images[:count], found[:count]), (found[count:], images[count:])
+    gaussians = trainer.gaussians()
+    trainer.release()
+    return ShortFit(trainer.config, split, gaussians, *tested, factor, wall_s, *trained)
+
+
+def _make_trainer(config: FitConfig, split: Dataset) -> Trainer:
+    config = resolve_defaults(config, split)
+    return Trainer(config, split, gaussians_at(_fewer(start_of(config, split)), config))
+
+
+def _fewer(start: Start) -> Start:
+    """Return at most as many points as a short fit has Gaussians."""
+    every = -(-len(start.means) // NUM_GAUSSIANS)
+    colors = None if start.colors is None else start.colors[::every]
+    return replace(start, means=start.means[::every], colors=colors)
+
+
+def shorten(config: FitConfig) -> FitConfig:
+    """Return the configuration of a short fit."""
+    iterations = min(MAX_ITERATIONS, round(SHARE_OF_ITERATIONS * config.iterations))
+    goal = getattr(config.densify.settings, "gaussians", None) or NUM_GAUSSIANS
+    changes = {
+        "densify.strategy": "budget",
+        "densify.budget.gaussians": min(goal, NUM_GAUSSIANS),
+        "densify.prune.to": None,
+        "init.num_points": None,
+        "coarse": None,
+        "optimizer.views_per_step": 1,
+    }
+    return with_changes(with_iterations(config, iterations), changes)
+
+
+def with_background(dataset: Dataset, config: FitConfig) -> Dataset:
+    """Return the dataset with the configured background behind opaque photographs."""
+    if any(view.alpha is not None for view in dataset.train) or config.data.background is None:
+        return dataset
+    return replace(dataset, background=config.data.background_rgb)
