@@ -2,7 +2,8 @@
 
 ``references/earlier_version`` was made by the version of November 2026, before classes and
 functions were renamed: a fit stopped after 50 of 80 iterations (``config.yml``,
-``checkpoint.npz``), its final ``point_cloud.ply``, and an image of that file by ``scene.xml``.
+``checkpoint.npz``), its final ``point_cloud.ply``, and an image of that file by ``scene.xml``;
+since then, a surface hides splats by the depths of their peaks where these order them.
 """
 
 import shutil
