@@ -58,7 +58,7 @@ def align(
 
     Masked pixels do not count, nor do those that the moved rendering does not cover. The background
     behind a transparent photograph, display space, has no gain. Where the numbers do not make the
-    images more alike, and in images below 8 px, the differences are none.
+    images more alike, and in images below 8 px, there are gains alone, by least squares.
     """
     photograph = np.asarray(view.image, np.float64)
     height, width, _ = photograph.shape
@@ -89,8 +89,12 @@ def align(
             left, toned = further, after
     farthest = max(np.abs(moved).max(), np.abs(others[3:]).max()) / (np.hypot(width, height) / 2)
     if is_covered.mean() < MIN_COVERED or farthest > MAX_MOVE or not toned < before:
-        gains, moved, others = np.zeros(3), np.zeros(4), np.zeros(8)
-        at, seen, left, error, toned = image, counts, photograph - image, before, before
+        moved, others = np.zeros(4), np.zeros(8)
+        at, seen, base = image, counts, image - behind
+        weights = counts[..., None] * base
+        gains = (weights * (photograph - image)).sum((0, 1)) / ((weights * base).sum((0, 1)) + 1e-9)
+        left = photograph - image - gains * base
+        error = toned = _mean_error(left, seen)
     return Alignment(
         gains=gains,
         shift=moved[:2],
