@@ -58,7 +58,7 @@ def align(
 
     Masked pixels do not count, nor do those that the moved rendering does not cover. The background
     behind a transparent photograph, display space, has no gain. Where the numbers do not make the
-    images more alike, and in images below 8 px, there are gains alone, by least squares.
+    images more alike, there are gains alone, by least squares, and in images below 8 px nothing.
     """
     photograph = np.asarray(view.image, np.float64)
     height, width, _ = photograph.shape
@@ -91,7 +91,7 @@ def align(
     if is_covered.mean() < MIN_COVERED or farthest > MAX_MOVE or not toned < before:
         moved, others = np.zeros(4), np.zeros(8)
         at, seen, base = image, counts, image - behind
-        weights = counts[..., None] * base
+        weights = counts[..., None] * base * (min(height, width) >= MIN_SIDE_PX)
         gains = (weights * (photograph - image)).sum((0, 1)) / ((weights * base).sum((0, 1)) + 1e-9)
         left = photograph - image - gains * base
         error = toned = _mean_error(left, seen)

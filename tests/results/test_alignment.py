@@ -114,13 +114,5 @@ def test_tiny_images_are_not_aligned(size):
     seen, other = rng.uniform(size=(2, *size, 3))
     small = replace(view_of(seen), width=size[1], height=size[0])
     found = align(small, other)
-    gains = [
-        np.linalg.lstsq(other[..., [c]].ravel()[:, None], (seen - other)[..., c].ravel())[0]
-        for c in range(3)
-    ]
-    # 1e-9, by which a black rendering has no gain, is relative to the square of one dark pixel.
-    np.testing.assert_allclose(found.gains, np.ravel(gains), rtol=1e-5)
-    np.testing.assert_array_equal(found.shift, 0)
-    left = seen - other * (1 + np.ravel(gains))
-    error = max(np.mean(np.square(left)), 1e-10)
-    assert found.psnr == pytest.approx(-10 * np.log10(error), rel=1e-5)
+    np.testing.assert_array_equal([*found.gains, *found.shift], 0)
+    assert found.psnr == pytest.approx(-10 * np.log10(np.mean(np.square(seen - other))))
