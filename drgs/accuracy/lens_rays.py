@@ -61,13 +61,7 @@ from drgs.splatting.footprint import (
     products,
 )
 from drgs.splatting.grid import Lanes
-from drgs.splatting.projection import (
-    FilmShape,
-    GaussianRows,
-    RayTerms,
-    Splats2D,
-    factor_conic,
-)
+from drgs.splatting.projection import FilmShape, GaussianRows, RayTerms, Splats2D, factor_conic
 
 NUM_OUTLINE_POINTS = 8
 MAX_OUTLINE_DEVIATION = 4.0  # of the farthest point from the nearest; beyond, there is no outline

@@ -14,13 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.cameras.viewpoints import OPENCV_TO_OPENGL, OPENGL_TO_MITSUBA, look_at
-from drgs.capture.path_tracing import (
-    SPLITS,
-    CaptureSettings,
-    CaptureView,
-    bounding_box,
-    scale_fov,
-)
+from drgs.capture.path_tracing import SPLITS, CaptureSettings, CaptureView, bounding_box, scale_fov
 from drgs.core.errors import UserError
 from drgs.core.types import Float
 

@@ -7,14 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from drgs.config.extensions import STRATEGIES
-from drgs.config.section import (
-    Count,
-    ExtensibleSection,
-    Resolved,
-    Section,
-    name_of,
-    subsection,
-)
+from drgs.config.section import Count, ExtensibleSection, Resolved, Section, name_of, subsection
 
 REFERENCE_START, REFERENCE_STOP = 500, 15_000  # iterations: the reference's schedule, for 30,000
 

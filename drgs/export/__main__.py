@@ -15,12 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.cameras.orbits import up_of
-from drgs.cli.commands import (
-    CommandParser,
-    bounded_int,
-    file_or_folder,
-    run_command,
-)
+from drgs.cli.commands import CommandParser, bounded_int, file_or_folder, run_command
 from drgs.cli.execution import select_variant
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.core.constants import LOW_PASS

@@ -17,15 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 import drgs
-from drgs.accuracy.error_budget import (
-    SAMPLES,
-    BudgetReport,
-    Choice,
-    Renderer,
-    Search,
-    Window,
-    crop,
-)
+from drgs.accuracy.error_budget import SAMPLES, BudgetReport, Choice, Renderer, Search, Window, crop
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera, cameras_in_time
 from drgs.config.approximations import Approximations

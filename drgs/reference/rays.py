@@ -239,6 +239,7 @@ def render_along(
     rho_sq = np.sum(np.cross(m, v) ** 2, axis=-1) / squared
     keys = t if centers is None else np.broadcast_to(centers, t.shape)
     is_before = t < np.broadcast_to(far, (height, width)).reshape(-1, 1)
+    is_before &= np.isfinite(directions).all(axis=-1).reshape(-1, 1)
     peaks = _Peaks(rho_sq, keys, keys, np.where(is_before, t, -inf))
     opacities = reference.sigmoid(gaussians.logit_opacities)
     splats = cast(_Splats, SimpleNamespace(opacities=opacities, sh=gaussians.sh))

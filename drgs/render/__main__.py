@@ -39,11 +39,7 @@ from drgs.io.formats import format_to_read, readable_formats
 from drgs.render.images import render_model
 from drgs.render.mitsuba_scene import render_mitsuba_scene
 from drgs.results.folder import CONFIG, METRICS
-from drgs.results.model import (
-    Render,
-    load_model,
-    open_image_folder,
-)
+from drgs.results.model import Render, load_model, open_image_folder
 from drgs.results.model_arguments import add_background, add_error, parse_background
 
 MAX_FRAMES = 10_000  # of an orbit: all cameras are created first

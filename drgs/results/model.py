@@ -27,13 +27,7 @@ from drgs.datasets import Dataset, load_dataset
 from drgs.effects.cameras import CAMERAS, CamerasConfig
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
-from drgs.integrator.scene import (
-    check_lenses,
-    check_sizes,
-    make_scene,
-    make_sensors,
-    render_views,
-)
+from drgs.integrator.scene import check_lenses, check_sizes, make_scene, make_sensors, render_views
 from drgs.integrator.state import is_splats
 from drgs.integrator.summary import format_effects, summary_of_views
 from drgs.io.images import write_png

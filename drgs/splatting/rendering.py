@@ -41,6 +41,7 @@ from drgs.splatting.projection import (
     project,
 )
 from drgs.splatting.rasterize import CompositedTiles, SplatGradients
+from drgs.splatting.ray_derivatives import add_rays_adjoint, tangents_with_rays
 from drgs.splatting.tiles import SplatTable, TileBins, bin_splats, splat_table
 
 Feature = Callable[[Splats2D, GaussianRows, Camera], list[Float]]
@@ -197,40 +198,8 @@ def frames_adjoint(
     )
     # dr.sum adds in the same order in every run.
     camera = [dr.sum(each) for each in by_row] if with_camera else None
-    if camera and first.tiles.bins.model.falloff.follows_rays:
-        of_rays = _rays_adjoint(frames, d_planes)
-        camera = [a + b for a, b in zip(camera, of_rays, strict=True)]
+    camera = add_rays_adjoint(frames, d_planes, camera)
     return replace(total, visible=on_film(first.tiles.bins), camera=camera)
-
-
-def _rays_adjoint(frames: list[Frame], d_planes: list[list[Float]]) -> list[Float]:
-    """Return derivatives with respect to the camera's numbers by way of the pixels' rays.
-
-    Those of the splats are left out. Each number takes a pass in forward mode; in the camera's own
-    axes, its rays do not depend on its pose unless it moves.
-    """
-    first = frames[0]
-    t, bins = types_of(first.tiles.bins.rows.Float), first.tiles.bins
-    zero, count = dr.zeros(t.Float, dr.width(bins.order)), len(first.camera.numbers())
-    still = SplatGradients([zero] * bins.model.falloff.num_geometry, [zero] * bins.num_features)
-    pose = 12 if first.camera.shutter is None else 0
-    totals = [dr.zeros(t.Float)] * pose
-    for number in range(pose, count):
-        tangents = [dr.opaque(t.Float, float(number == k)) for k in range(count)]
-        total = dr.zeros(t.Float)
-        for frame, of_frame in zip(frames, d_planes, strict=True):
-            planes = frame.order.tangent(_with_camera_tangents(frame.tiles, tangents), still)
-            products = (a * b for a, b in zip(planes, of_frame, strict=True))
-            total = sum((dr.sum(product) for product in products), total)
-        totals.append(total)
-    return totals
-
-
-def _with_camera_tangents(tiles: CompositedTiles, camera_tangents: list[Float]) -> CompositedTiles:
-    """Return the tiles, whose tangent includes that of the camera's rays."""
-    model = tiles.bins.model
-    model = replace(model, falloff=model.falloff.with_camera_tangents(camera_tangents))
-    return replace(tiles, bins=replace(tiles.bins, model=model))
 
 
 def splats_adjoint(frames: list[Frame], d_planes: list[list[Float]]) -> SplatGradients:
@@ -418,10 +387,7 @@ def frames_tangent(
     dr.eval(columns)
     count = frame.tiles.bins.model.falloff.num_geometry
     direction = SplatGradients(geometry=columns[:count], features=columns[count:])
-    tiles = [frame.tiles for frame in frames]
-    if camera_tangents is not None:
-        tiles = [_with_camera_tangents(each, camera_tangents) for each in tiles]
-    return [frame.order.tangent(each, direction) for frame, each in zip(frames, tiles, strict=True)]
+    return tangents_with_rays(frames, direction, camera_tangents)
 
 
 def _columns_of(

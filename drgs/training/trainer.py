@@ -18,12 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from drgs.config.schema import FitConfig
-from drgs.core.adam import (
-    make_optimizer,
-    optimizer_state,
-    pending_gradients,
-    restore_optimizer,
-)
+from drgs.core.adam import make_optimizer, optimizer_state, pending_gradients, restore_optimizer
 from drgs.core.memory import release_unused_memory
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
@@ -34,12 +29,7 @@ from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.state import SplatsPlugin
 from drgs.splatting.rendering import NO_FAULT
 from drgs.training.density.phases import density_strategy
-from drgs.training.density.strategy import (
-    DensityReport,
-    DensityStrategy,
-    PixelWeight,
-    StepInfo,
-)
+from drgs.training.density.strategy import DensityReport, DensityStrategy, PixelWeight, StepInfo
 from drgs.training.finite_checks import GradientWatch, WatchedIteration, check_values
 from drgs.training.losses import Loss, make_loss, make_loss_terms
 from drgs.training.parallel.communicator import Communicator

@@ -11,11 +11,7 @@ from typing_extensions import override
 
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import types_of
-from drgs.training.density.strategy import (
-    DensityReport,
-    DensityStrategy,
-    Population,
-)
+from drgs.training.density.strategy import DensityReport, DensityStrategy, Population
 
 MIN_OPACITY = 0.005
 """Less opaque Gaussians are removed."""
