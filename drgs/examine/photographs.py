@@ -24,7 +24,7 @@ NORMAL = 1.4826  # standard deviation over the median absolute one, of a normal 
 MAX_SHOWN, MAX_SHARE = 4, 0.15  # photographs in the table; of all, or they are no single ones
 
 MAX_DEVIATIONS = 5.0
-"""Of the middle, in normal deviations: photographs that differ by more are bad."""
+"""Normal deviations from the middle: photographs that differ by more are bad."""
 
 LEAST_DEVIATIONS = {"psnr": 0.8, "sharpness": 0.06}
 """Deviations (dB; logarithm of steps between pixels), where photographs are more alike."""

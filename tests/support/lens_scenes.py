@@ -235,7 +235,7 @@ ROW_MARGIN, MAX_ROW_RATE = 0.5, 0.5
 
 
 def row_time(camera_at, lens, mean) -> tuple[float, bool]:
-    """When the row that shows a mean is read, and whether it is read: the root of row less time."""
+    """Return when the row that shows a mean is read, the root of row less time, and if it is."""
 
     def behind(time) -> float:
         camera = camera_at(time)
