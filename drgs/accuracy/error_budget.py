@@ -20,7 +20,7 @@ Costs are typical ones, not measured: the choice is the same in every run.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any, NamedTuple
@@ -50,7 +50,7 @@ NEGLIGIBLE = 0.25  # of the budget: error of the most accurate image that is not
 
 SAMPLES = "shutter_samples"
 
-Changes = Mapping[str, Any]
+Changes = dict[str, Any]
 """Values of approximations by name, and of :data:`SAMPLES`."""
 
 Window = tuple[int, int, int, int]
@@ -237,7 +237,7 @@ class Renderer:
     the last argument is the number of times of an open shutter."""
 
     given: Approximations  # their filters and falloff are kept
-    residual: Callable[[Camera, Window | None, Approximations], float]
+    residual: Callable[[Camera, Window, Approximations], float]
     """Returns the mean square error of the most accurate image, as far as it is known; or 0."""
 
     def image(self, camera: Camera, *changes: Changes, window: Window | None = None) -> np.ndarray:
@@ -330,7 +330,8 @@ class Search:
             self._views = [
                 MeasuredView.draw(
                     camera,
-                    *(self._image(k, order, True) for order in ({}, WINDOWED[0].changes)),
+                    self._image(k, {}, True),
+                    self._image(k, WINDOWED[0].changes, True),
                     (k + 0.5) / len(measured),
                 )
                 for k, camera in enumerate(measured)

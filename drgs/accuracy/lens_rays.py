@@ -122,7 +122,7 @@ class PixelRay:
         at = own.at_row(y)
         origin, direction, seen = at.look_through(x, y)
         unit = dr.normalize(direction)
-        unit *= at.lens.ray_range(unit, 1, 1)[0]
+        unit *= at.lens.ray_range(unit, type(x)(1), type(x)(1))[0]
         unit = at.rotation.T @ dr.select(seen, unit, 0)
         if not has_origins(camera):
             return PixelRay(unit, None)
@@ -383,7 +383,7 @@ class LensRayFalloff(GaussianFalloff):
                 d_f = dr.fma(slope, change, d_f)
             if has_origins(self.camera):
                 d_origin = -t.Array3f(d_geometry[18:21])
-                if moved is not None:
+                if moved is not None and moved.origin is not None:
                     d_origin += moved.origin
                 slopes = footprint.d_o[0][k], footprint.d_o[1][k], -footprint.d_b[k]
                 for (row, d_row), slope in zip(rows, slopes, strict=True):

@@ -256,9 +256,8 @@ def keep_error_budget(splats: SplatsState, scene: mi.Scene) -> None:
         return
     then, measured, cameras = splats.budget_evidence
     names = [k for k in now | then if not _is_same(now.get(k), then.get(k))]
-    is_known = rendered is None or any(rendered is one for one in measured)
-    if not is_known and camera_values(rendered, near) not in cameras:
-        names.append("the sensor")
+    if rendered is not None and all(rendered is not one for one in measured):
+        names += ["the sensor"] * (camera_values(rendered, near) not in cameras)
     if names:
         report = splats.budget_report = replace(report, stale=format_names(names))
         message = (

@@ -37,12 +37,13 @@ def memory_path(gaussians: Path) -> Path | None:
 def recall(path: Path | None, digest: str, given: Approximations) -> BudgetReport | None:
     """Return the choice for a digest; given: approximations that it changes. None: unknown."""
     try:
-        found = dict(_read(path)[digest])
+        found: dict[str, Any] = dict(_read(path)[digest])
         for name in CHOICES:
             if (values := found[name]) is not None:
                 changes = {k: v for k, v in values["changes"].items() if k != SAMPLES}
                 found[name] = Choice(replace(given, **changes), **values)
-        report = BudgetReport(**found | {"errors": tuple(found["errors"])})
+        found["errors"] = tuple(found["errors"])
+        report = BudgetReport(**found)
         report.line()  # which fails for values of a wrong type
     except (KeyError, TypeError, ValueError, AttributeError):
         return None

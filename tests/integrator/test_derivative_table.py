@@ -10,9 +10,11 @@ prints it anew.
 from __future__ import annotations
 
 import csv
+import gc
 import sys
+import types
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -380,6 +382,23 @@ def test_poses_lit_by_other_surfaces_are_differentiated():
     others = {"sky": None, "wall": {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}}
     case = Case("wall.to_world", others=others, move=translate(0, 0, 1), spp=2**15)
     assert measure(case, "`splatpath`").error < 0.01
+
+
+def test_scenes_are_freed_although_a_layer_does_not_depend_on_the_parameter():
+    """Not by a later collection: during a trace, Dr.Jit would end the program."""
+    case, is_enabled = cases()["`thindielectric` `specular_reflectance`"], gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        Loss(replace(case, spp=4), "`path`").derivative()
+        gc.set_debug(gc.DEBUG_SAVEALL)
+        gc.collect()
+        assert not any(isinstance(one, types.FrameType) for one in gc.garbage)
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        if is_enabled:
+            gc.enable()
 
 
 def test_hair_is_rendered_despite_a_parameter_without_value():

@@ -350,17 +350,17 @@ class NestedSurfaces:
     def _needed_surfaces(self, differentiate: Callable[[mi.Sensor], T]) -> list[T | None]:
         """Differentiate nested images; None for those that do not depend on parameters."""
         found: list[T | None] = []
-        errors: list[Exception] = []
+        reasons: list[str] = []  # not errors: their tracebacks hold the scene until it is collected
         for sensor in self._sensors():
             try:
                 found.append(differentiate(sensor))
             except Exception as error:
-                if not any(words in str(root_cause(error)) for words in INDEPENDENT):
+                reasons.append(str(root_cause(error)))
+                if not any(words in reasons[-1] for words in INDEPENDENT):
                     raise
                 found.append(None)
-                errors.append(error)
-        if len(errors) == len(found):
-            raise errors[0]
+        if len(reasons) == len(found):
+            raise UnsupportedError(reasons[0])
         return found
 
     def _sensors(self) -> Iterator[mi.Sensor]:
