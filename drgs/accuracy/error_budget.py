@@ -338,7 +338,7 @@ class Search:
             ]
         last = projected[-1], WINDOWED[-1], DIRECTIONS[-1]
         self._best = {k: v for level in last for k, v in level.changes.items()} | FINEST_CUT_OFFS
-        self._orders = self._squares_of_orders()
+        self._orders = self._squares_of_orders(projected[-1].changes)
         squares = [
             self._orders,
             self._squares(projected, projected[-1].changes),
@@ -347,8 +347,10 @@ class Search:
         ]
         samples = shutter_samples(measured)
         self._most_samples = {SAMPLES: 2 * samples[-1].changes[SAMPLES]} if samples else {}
+        self._moving = projected[-1].changes | WINDOWED[0].changes  # as other orders change in time
         if samples:
-            squares.append(self._squares(samples, self._most_samples))
+            found = [(one, self._squares_of_samples(one.changes)) for one in samples]
+            squares.append([LevelSquares(one, each, each) for one, each in found])
         self.front = self._front(squares)
         """Combinations that no other one beats in cost and predicted error, by cost."""
 
@@ -388,19 +390,22 @@ class Search:
             found.append(LevelSquares(level, *(np.repeat(each, step)[:count] for each in pair)))
         return found
 
-    def _squares_of_orders(self) -> list[LevelSquares]:
-        """Return those of orders; all contain the errors of the most accurate image.
+    def _squares_of_orders(self, projection: Changes) -> list[LevelSquares]:
+        """Return those of orders, with a projection; all contain the most accurate image's errors.
 
         These are extrapolated from two windows of splats, or what the renderer has found.
         """
-        levels, target = (CENTER, *WINDOWED), WINDOWED[-1].changes
-        squares = [self._differences(level.changes, target) for level in levels]
+        levels, target = (CENTER, *WINDOWED), projection | WINDOWED[-1].changes
+        squares = [self._differences(projection | level.changes, target) for level in levels]
         *_, before, last, _ = squares
         rest, values = last / np.maximum(before, 1e-20), replace(self._renderer.given, **self._best)
         found = [self._renderer.residual(one.camera, one.window, values) for one in self._views]
         self._unordered = np.maximum(last * np.minimum(rest, 0.5), found)
         sums = [each + self._unordered for each in squares]
         return [LevelSquares(level, each, each) for level, each in zip(levels, sums, strict=True)]
+
+    def _squares_of_samples(self, changes: Changes) -> np.ndarray:
+        return self._differences(self._moving | changes, self._moving | self._most_samples)
 
     def _front(self, squares: Sequence[Sequence[LevelSquares]]) -> list[Combination]:
         found = []
@@ -451,7 +456,7 @@ class Search:
         measured = self._differences(changes, best) + rest
         if self._most_samples:
             samples = {SAMPLES: candidate.choice.changes[SAMPLES]}
-            measured += self._differences(samples, self._most_samples)
+            measured += self._squares_of_samples(samples)
         return measured
 
     def cheapest(self, budget: float) -> tuple[int, list[float], list[float]]:

@@ -37,7 +37,7 @@ from drgs.splatting.footprint import PixelCenters
 from drgs.splatting.projection import load_rows
 
 PATHS = 16  # per pixel, of the radiance of surfaces
-APERTURE_POINTS = 32
+APERTURE_POINTS, APERTURE_WINDOW = 32, 4
 RESIDUAL_PX = 48  # side of the part of a window in which rays are traced
 FILM_NUMBERS = ("width", "height", "crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
 LARGE = 0.25  # standard deviation of a splat relative to its depth, whose order is hard to find
@@ -82,18 +82,19 @@ def ray_residual(
     as those of half the window of splats do, with it and without. 0 where no visible Gaussian is
     :data:`LARGE`, and for cameras that move. With an aperture, see :func:`aperture_residual`.
     """
+    x, y, *sides = window
+    left, top = (max(side - RESIDUAL_PX, 0) // 2 for side in sides)
+    width, height = (min(side, RESIDUAL_PX) for side in sides)
+    part = crop(camera, x + left, y + top, width, height)
     if camera.aperture is not None:
-        return aperture_residual(gaussians, sh_degree, crop(camera, *window), approximations)
+        return aperture_residual(gaussians, sh_degree, part, approximations)
     rows, t = load_rows(gaussians, sh_degree), types_of(type(camera.near))
     position = camera.rotation @ (rows.means - camera.center)
     visible, _, depth = camera.lens.visibility(camera, position)
     is_large = dr.exp(dr.max(rows.log_scales)) > LARGE * depth
     if camera.shutter is not None or not dr.any(visible & is_large):
         return 0.0
-    x, y, *sides = window
-    left, top = (max(side - RESIDUAL_PX, 0) // 2 for side in sides)
-    width, height = (min(side, RESIDUAL_PX) for side in sides)
-    camera = crop(camera, x + left, y + top, width, height)
+    camera = part
 
     def planes(low_pass: float, window: int) -> np.ndarray:
         how = replace(approximations, low_pass=low_pass, order_window=window)
@@ -127,9 +128,9 @@ def aperture_residual(
 ) -> float:
     """Return the mean square difference from the mean of pinholes' images, all over an aperture.
 
-    Over black or white, in the order of the means.
+    Over black or white, with a small window of splats: a place's order is not all of the aperture's.
     """
-    pipeline = pipeline_of(replace(approximations, order="center"), sh_degree)
+    pipeline = pipeline_of(replace(approximations, order_window=APERTURE_WINDOW), sh_degree)
 
     def planes(one: Camera) -> np.ndarray:
         frame = rendering.render(gaussians, one, with_effects(pipeline, gaussians, one))
