@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
+from numbers import Integral, Real
 from typing import Any, cast
 
 import drjit as dr
@@ -75,6 +77,10 @@ COEFFICIENTS: list[tuple[str | int, ...]] = [("N", "K", 3), ("C", "N", "K", 3)]
 """Shapes of ``colors`` with ``sh_degree``."""
 
 
+LARGEST = {"scales": 1e37, "opacities": 1.0}
+"""Largest values of what is not negative."""
+
+
 def rasterization(
     means: Array,
     quats: Array,
@@ -139,7 +145,11 @@ def rasterization(
     """
     selected = _approximations(approximations, eps2d, rasterize_mode, sh_degree)
     _require(render_mode in RENDER_MODES, "render_mode", f"one of {RENDER_MODES}", render_mode)
-    _require(width >= 1 and height >= 1, "width and height", "1 px or more", (width, height))
+    for name, value in (("width", width), ("height", height)):
+        is_size = isinstance(value, Integral) and value >= 1
+        _require(is_size, name, "a whole number, 1 px or more", value)
+    is_distance = isinstance(near_plane, Real) and 0 <= near_plane < math.inf
+    _require(is_distance, "near_plane", "a distance, 0 or more", near_plane)
     why = too_large_reason(int(width), int(height))
     _require(why is None, "width and height", f"smaller: {why}", (width, height))
     tensor_type = _tensor_type(means)
@@ -149,9 +159,13 @@ def rasterization(
     inputs = {
         name: _tensor(name, value, tensor_type)
         for name, value in zip(SHAPES, given, strict=True)
-        if value is not None
+        if not (name == "backgrounds" and value is None)
     }
     _check_shapes(inputs, sh_degree)
+    for name, largest in LARGEST.items():
+        value = dr.detach(inputs[name].array)
+        is_within = dr.all((value >= 0) & (value <= largest))
+        _require(bool(is_within), name, f"numbers from 0 to {largest:g}", "others")
     _check_cameras(*(np.array(inputs[name], np.float64) for name in ("viewmats", "Ks")))
     color = NamedFeature("colors") if sh_degree is None else color_features
     features = () if render_mode in ("D", "ED") else (color,)
@@ -202,7 +216,7 @@ def _approximations(
 
 def _tensor_type(means: Array) -> type[TensorXf]:
     """Return the type of all tensors: that of ``means``."""
-    if dr.is_tensor_v(means) and dr.is_float_v(means):
+    if dr.is_array_v(means) and dr.is_tensor_v(means) and dr.is_float_v(means):
         return cast(type[TensorXf], type(means))
     if dr.is_array_v(means):
         raise TypeError(
@@ -210,8 +224,16 @@ def _tensor_type(means: Array) -> type[TensorXf]:
         )
     from drjit import llvm
 
-    is_double = np.asarray(means).dtype == np.float64
+    is_double = _host("means", means).dtype == np.float64
     return cast(type[TensorXf], llvm.ad.TensorXf64 if is_double else llvm.ad.TensorXf)
+
+
+def _host(name: str, value: Any) -> np.ndarray:
+    """Return an array that is none of Dr.Jit's, of real numbers."""
+    with suppress(ValueError):  # rows of different lengths
+        if (values := np.asarray(value)).dtype.kind in "biuf":
+            return values
+    raise TypeError(f"rasterization(): {name} must be an array of real numbers, got {value!r:.80}")
 
 
 def _tensor(name: str, value: Any, tensor_type: type[TensorXf]) -> TensorXf:
@@ -220,7 +242,7 @@ def _tensor(name: str, value: Any, tensor_type: type[TensorXf]) -> TensorXf:
         return value
     flat_type = dr.array_t(tensor_type)
     if not dr.is_array_v(value):
-        values = np.asarray(value)
+        values = _host(name, value)
         return tensor_type(from_host(flat_type, values), values.shape)
     if dr.is_tensor_v(value):
         return tensor_type(flat_type(value.array), value.shape)
@@ -259,8 +281,8 @@ def _check_cameras(viewmats: np.ndarray, Ks: np.ndarray) -> None:
     """Raise ValueError for a K that is no pinhole's, or a singular viewmat."""
     for index, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
         pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
-        fits = np.abs(K - pinhole).max() <= MAX_SKEW * np.abs(K).max() or np.isnan(K).any()
-        expected = "((fx, 0, cx), (0, fy, cy), (0, 0, 1)), without skew"
+        fits = np.abs(K - pinhole).max() <= MAX_SKEW * np.abs(K).max() < math.inf
+        expected = "((fx, 0, cx), (0, fy, cy), (0, 0, 1)), of finite numbers, without skew"
         _require(fits, f"Ks[{index}]", expected, K.tolist())
         is_regular = np.isfinite(viewmat).all() and np.linalg.matrix_rank(viewmat[:3, :3]) == 3
         expected = "matrices of a rotation and a translation, of finite numbers"

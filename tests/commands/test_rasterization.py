@@ -326,7 +326,15 @@ REFUSED = [
     ({"sh_degree": None}, r"colors must be of shape \(24, D\) or \(2, 24, D\)"),
     ({"sh_degree": 4}, "sh_degree must be None or 0 to 3, got 4"),
     ({"render_mode": "depth"}, "render_mode must be one of .*, got 'depth'"),
-    ({"width": 0}, "width and height must be 1 px or more"),
+    ({"width": 0}, "width must be a whole number, 1 px or more, got 0"),
+    ({"height": 24.0}, "height must be a whole number, 1 px or more, got 24.0"),
+    ({"width": None}, "width must be a whole number, 1 px or more, got None"),
+    ({"near_plane": np.nan}, "near_plane must be a distance, 0 or more, got nan"),
+    ({"near_plane": "x"}, "near_plane must be a distance, 0 or more, got 'x'"),
+    ({"Ks": np.full((2, 3, 3), np.nan)}, r"Ks\[0\] must be .* of finite numbers"),
+    ({"scales": np.full((24, 3), -0.1)}, "scales must be numbers from 0 to 1e"),
+    ({"opacities": np.full(24, 2.0)}, "opacities must be numbers from 0 to 1, "),
+    ({"opacities": np.full(24, np.nan)}, "opacities must be numbers from 0 to 1, "),
     ({"width": 10**6, "height": 10**6}, r"width and height must be smaller: .* too many"),
     (
         {**FLAT, "colors": np.ones((24, 2000)), "backgrounds": None},
@@ -347,3 +355,15 @@ def test_mismatched_arguments_are_refused_by_name(changes, message):
     error = TypeError if names else ValueError
     with pytest.raises(error, match=rf"rasterization\(\): .*{message}"):
         drgs.rasterization(**{**scene(), **FILM, "sh_degree": 3, **changes})
+
+
+ARRAYS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+@pytest.mark.parametrize(
+    "value", [None, "abc", np.array([{}]), np.ones(2) * 1j, [[1.0], [1.0, 2.0]]]
+)
+def test_what_is_no_array_of_numbers_is_refused_by_name(name, value):
+    with pytest.raises(TypeError, match=rf"rasterization\(\): {name} must be an array of real"):
+        drgs.rasterization(**{**scene(), **FILM, "sh_degree": 3, name: value})
