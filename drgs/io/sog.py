@@ -50,6 +50,7 @@ from drgs.io.quantization import (
 )
 
 MAX_BYTES = 1 << 32  # largest file: 4.3 GB
+MAX_RATIO, MAX_SMALL = 16, 1 << 20  # of a file in an archive to its packed bytes, and bytes of any
 
 META = "meta.json"
 LEVELS = 256
@@ -229,8 +230,14 @@ def _load(path: Path, name: str) -> bytes:
         refuse_damage(f"{path}: cannot read {one_line(name, 60)}"),
         zipfile.ZipFile(file) as archive,
     ):
-        require_memory(path, archive.getinfo(name).file_size, name)
-        return archive.read(name)
+        entry = archive.getinfo(name)
+        if entry.file_size > MAX_RATIO * entry.compress_size + MAX_SMALL:
+            raise ValueError(
+                f"at most {MAX_RATIO} times its {entry.compress_size:,} packed bytes were "
+                f"expected, got {entry.file_size:,}; images do not shrink more"
+            )
+        require_memory(path, entry.file_size, name)
+        return archive.read(entry)
 
 
 def _pixels(path: Path, name: str, least: int, width: int | None = None) -> np.ndarray:

@@ -198,3 +198,13 @@ def test_wrong_content_is_refused(tmp_path, name):
 def test_another_file_is_refused(tmp_path):
     (tmp_path / "a.sog").write_bytes(b"hello")
     assert refusal(tmp_path / "a.sog").startswith("cannot read meta.json: File is not a zip")
+
+
+@pytest.mark.parametrize("name", ["means_l.webp", "meta.json"])
+def test_archives_that_declare_much_more_than_they_hold_are_not_unpacked(tmp_path, name):
+    files = unpacked(gaussians_within_ranges(60, degree=1)) | {name: bytes(1 << 24)}
+    with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_DEFLATED) as archive:
+        for each, content in files.items():
+            archive.writestr(each, content)
+    expected = f"cannot read {name}: at most 16 times its "
+    assert refusal(tmp_path / "a.sog").startswith(expected)
