@@ -77,10 +77,6 @@ COEFFICIENTS: list[tuple[str | int, ...]] = [("N", "K", 3), ("C", "N", "K", 3)]
 """Shapes of ``colors`` with ``sh_degree``."""
 
 
-LARGEST = {"scales": 1e37, "opacities": 1.0}
-"""Largest values of what is not negative."""
-
-
 def rasterization(
     means: Array,
     quats: Array,
@@ -162,7 +158,7 @@ def rasterization(
         if not (name == "backgrounds" and value is None)
     }
     _check_shapes(inputs, sh_degree)
-    for name, largest in LARGEST.items():
+    for name, largest in (("scales", 1e37), ("opacities", 1.0)):
         value = dr.detach(inputs[name].array)
         is_within = dr.all((value >= 0) & (value <= largest))
         _require(bool(is_within), name, f"numbers from 0 to {largest:g}", "others")

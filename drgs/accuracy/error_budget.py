@@ -44,7 +44,8 @@ AREA_SHARE = 0.2  # of the probability of a cell, by its area; the rest by its e
 CONFIDENCE = 0.95  # share of the views that shall be within the budget
 TYPICAL_SPREAD = 0.15  # of the logarithm of the errors of a file's views
 CLEARLY = 0.9  # of the error or the time of a choice, the next one's at most
-SPREAD_VIEWS = 6  # views that TYPICAL_SPREAD counts for
+FEWEST_ORDERS = 3  # windows of splats that are measured at least; more where budgets ask for them
+SPREAD_VIEWS = 3  # views that TYPICAL_SPREAD counts for
 SLACK = 1.5  # of predicted errors over the budget, up to which a choice is measured
 NEGLIGIBLE = 0.25  # of the budget: error of the most accurate image that is not worth a word
 
@@ -78,7 +79,7 @@ def cut_offs(alpha_cut: float, transmittance_stop: float) -> Changes:
 CENTER = Level({"order": "center"}, 1)
 WINDOWED = tuple(
     Level({"order": "pixel", "order_window": window}, cost)
-    for window, cost in ((1, 3.3), (4, 4.4), (8, 7), (16, 12), (32, 22))
+    for window, cost in ((1, 3.3), (4, 4.4), (8, 7), (16, 12), (32, 22), (64, 42))
 )
 """Costs are those of ``docs/results/accuracy.md``, rounded, as are those of the others."""
 
@@ -93,15 +94,15 @@ FINEST_CUT_OFFS = cut_offs(1e-5, 1e-7)
 
 def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:
     """Return the projections that the cameras' lenses allow, the most accurate one last."""
-    ewa, unscented = Level({"projection": "ewa"}, 1), Level({"projection": "unscented"}, 1.03)
+    ewa, unscented = Level({"projection": "ewa"}, 1), Level({"projection": "unscented"}, 1.15, 1.03)
     if any(camera.shutter is not None and camera.shutter.reads_rows for camera in cameras):
-        return ewa, unscented, Level({"projection": "exact"}, 2.2, 1.5)
+        return ewa, unscented, Level({"projection": "exact"}, 2.6, 1.6)
     if all(isinstance(camera.lens, Pinhole) for camera in cameras):
         return ewa, Level({"projection": "exact"}, 1.2, 1.05)
     if all(camera.lens.parallel for camera in cameras):
         # Along parallel rays, projected Gaussians are Gaussians.
         return (ewa,)
-    return ewa, unscented, Level({"projection": "exact"}, 1.8, 1.3)
+    return ewa, unscented, Level({"projection": "exact"}, 2.0, 1.4)
 
 
 def shutter_samples(cameras: Sequence[Camera]) -> tuple[Level, ...]:
@@ -311,8 +312,11 @@ class Combination(NamedTuple):
 class Search:
     """Combinations of levels for some cameras, their predicted errors, and those measured."""
 
-    def __init__(self, renderer: Renderer, cameras: Sequence[Camera]) -> None:
-        """Measure each level alone on some views, and predict the errors of all combinations."""
+    def __init__(self, renderer: Renderer, cameras: Sequence[Camera], least: float = 0.0) -> None:
+        """Measure each level alone on some views, and predict the errors of all combinations.
+
+        least: budget below which none is asked for, so that orders need not be more accurate.
+        """
         check_no_extensions(renderer.given)
         self._renderer = renderer
         pixels = [camera.width * camera.height for camera in cameras]
@@ -336,9 +340,14 @@ class Search:
                 )
                 for k, camera in enumerate(measured)
             ]
-        last = projected[-1], WINDOWED[-1], DIRECTIONS[-1]
-        self._best = {k: v for level in last for k, v in level.changes.items()} | FINEST_CUT_OFFS
-        self._orders = self._squares_of_orders(projected[-1].changes)
+        self._projection = projected[-1].changes
+        for count in range(FEWEST_ORDERS, len(WINDOWED) + 1):
+            last = projected[-1], WINDOWED[count - 1], DIRECTIONS[-1]
+            self._best = {k: v for one in last for k, v in one.changes.items()} | FINEST_CUT_OFFS
+            limit = (NEGLIGIBLE * least) ** 2 if count < len(WINDOWED) else math.inf
+            self._orders = self._squares_of_orders(WINDOWED[:count], limit)
+            if self._unordered.max() <= limit:
+                break
         squares = [
             self._orders,
             self._squares(projected, projected[-1].changes),
@@ -347,7 +356,6 @@ class Search:
         ]
         samples = shutter_samples(measured)
         self._most_samples = {SAMPLES: 2 * samples[-1].changes[SAMPLES]} if samples else {}
-        self._moving = projected[-1].changes | WINDOWED[0].changes  # as other orders change in time
         if samples:
             found = [(one, self._squares_of_samples(one.changes)) for one in samples]
             squares.append([LevelSquares(one, each, each) for one, each in found])
@@ -390,22 +398,26 @@ class Search:
             found.append(LevelSquares(level, *(np.repeat(each, step)[:count] for each in pair)))
         return found
 
-    def _squares_of_orders(self, projection: Changes) -> list[LevelSquares]:
-        """Return those of orders, with a projection; all contain the most accurate image's errors.
+    def _squares_of_orders(self, windowed: Sequence[Level], limit: float) -> list[LevelSquares]:
+        """Return those of orders, with the best projection; all contain the best image's errors.
 
-        These are extrapolated from two windows of splats, or what the renderer has found.
+        These are extrapolated from two windows of splats, and within a limit not below what the
+        renderer finds.
         """
-        levels, target = (CENTER, *WINDOWED), projection | WINDOWED[-1].changes
-        squares = [self._differences(projection | level.changes, target) for level in levels]
+        levels, target = (CENTER, *windowed), self._projection | windowed[-1].changes
+        squares = [self._differences(self._projection | level.changes, target) for level in levels]
         *_, before, last, _ = squares
         rest, values = last / np.maximum(before, 1e-20), replace(self._renderer.given, **self._best)
-        found = [self._renderer.residual(one.camera, one.window, values) for one in self._views]
-        self._unordered = np.maximum(last * np.minimum(rest, 0.5), found)
+        self._unordered = last * np.minimum(rest, 0.5)
+        if self._unordered.max() <= limit:
+            found = [self._renderer.residual(one.camera, one.window, values) for one in self._views]
+            self._unordered = np.maximum(self._unordered, found)
         sums = [each + self._unordered for each in squares]
         return [LevelSquares(level, each, each) for level, each in zip(levels, sums, strict=True)]
 
     def _squares_of_samples(self, changes: Changes) -> np.ndarray:
-        return self._differences(self._moving | changes, self._moving | self._most_samples)
+        order = self._projection | WINDOWED[0].changes  # orders change in time
+        return self._differences(order | changes, order | self._most_samples)
 
     def _front(self, squares: Sequence[Sequence[LevelSquares]]) -> list[Combination]:
         found = []
@@ -449,8 +461,8 @@ class Search:
         """
         candidate, best, rest = self.front[place], self._best, self._unordered
         changes = {k: v for k, v in candidate.choice.changes.items() if k != SAMPLES}
-        *_, other, _ = self._orders
-        is_before = all(changes != changes | one.changes for one in WINDOWED[-2:])
+        *_, other, last = self._orders
+        is_before = all(changes != changes | one.level.changes for one in (other, last))
         if self.bound is not max and is_before:
             best, rest = best | other.level.changes, other.in_windows
         measured = self._differences(changes, best) + rest

@@ -128,7 +128,7 @@ def aperture_residual(
 ) -> float:
     """Return the mean square difference from the mean of pinholes' images, all over an aperture.
 
-    Over black or white, with a small window of splats: a place's order is not all of the aperture's.
+    Over black or white, with a small window of splats: orders differ over the aperture.
     """
     pipeline = pipeline_of(replace(approximations, order_window=APERTURE_WINDOW), sh_degree)
 
@@ -233,7 +233,7 @@ def meet_error_budget(
             drawer = SceneRenderer(copy, scene, list(zip(cameras, alone, strict=True)))
             residual = partial(ray_residual, dr.detach(copy.gaussians), copy.sh_degree)
             renderer = Renderer(drawer.draw, splats.given_approximations, residual)
-            report = splats.budget_report = Search(renderer, cameras).choose(budget)
+            report = splats.budget_report = Search(renderer, cameras, budget).choose(budget)
     except ValueError as error:
         raise PluginError(f"splats: error {error}") from None
     return report

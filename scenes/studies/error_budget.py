@@ -134,7 +134,7 @@ def study(subject: Subject) -> list[list[str]]:
         cheapest = min((cost for cost, error in oracle if error <= budget), default=math.nan)
         started = time.perf_counter()
         try:
-            report = budgets.Search(renderer, subject.cameras).choose(budget)
+            report = budgets.Search(renderer, subject.cameras, budget).choose(budget)
         except ValueError as refusal:
             rows.append([subject.name, f"{budget:g}", str(refusal), "", "", "", ""])
             continue
