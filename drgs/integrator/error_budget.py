@@ -65,12 +65,13 @@ def renderer_of(
             images.append(np.stack(colors, axis=-1) + transmittance[:, None] * color)
         return np.mean(images, axis=0).reshape(camera.height, camera.width, 3)
 
-    return Renderer(draw, given, partial(ray_residual, gaussians, sh_degree))
+    return Renderer(draw, given, partial(ray_residual, gaussians, sh_degree, {}))
 
 
 def ray_residual(
     gaussians: Gaussians,
     sh_degree: int,
+    kept: dict[tuple, np.ndarray],
     camera: Camera,
     window: Window,
     approximations: Approximations,
@@ -81,20 +82,20 @@ def ray_residual(
     white, without the low-pass filter, which rays do not have. Filtered images differ less: as much
     as those of half the window of splats do, with it and without. 0 where no visible Gaussian is
     :data:`LARGE`, and for cameras that move. With an aperture, see :func:`aperture_residual`.
+    kept: colours along rays, for other orders.
     """
-    x, y, *sides = window
+    key, (x, y, *sides) = (id(camera), window), window
     left, top = (max(side - RESIDUAL_PX, 0) // 2 for side in sides)
     width, height = (min(side, RESIDUAL_PX) for side in sides)
-    part = crop(camera, x + left, y + top, width, height)
+    whole, camera = camera, crop(camera, x + left, y + top, width, height)
     if camera.aperture is not None:
-        return aperture_residual(gaussians, sh_degree, part, approximations)
+        return aperture_residual(gaussians, sh_degree, camera, approximations)
     rows, t = load_rows(gaussians, sh_degree), types_of(type(camera.near))
     position = camera.rotation @ (rows.means - camera.center)
-    visible, _, depth = camera.lens.visibility(camera, position)
+    visible, _, depth = camera.lens.visibility(whole, position)
     is_large = dr.exp(dr.max(rows.log_scales)) > LARGE * depth
     if camera.shutter is not None or not dr.any(visible & is_large):
         return 0.0
-    camera = part
 
     def planes(low_pass: float, window: int) -> np.ndarray:
         how = replace(approximations, low_pass=low_pass, order_window=window)
@@ -102,23 +103,23 @@ def ray_residual(
         frame = rendering.render(gaussians, camera, pipeline)
         return np.array([np.array(plane) for plane in frame.planes()], np.float64)
 
-    pipeline = with_effects(pipeline_of(approximations, sh_degree), gaussians, camera)
-    rows = replace(rows, logit_opacities=dr.select(visible, rows.logit_opacities, -dr.inf))
-    splats = RaySplats.from_gaussians(pipeline.rows(rows), sh_degree, pipeline.model.cutoffs)
-    pixel = dr.arange(t.UInt32, width * height)
-    row = pixel // width
-    place = t.Float(pixel - row * width) + 0.5, t.Float(row) + 0.5
-    origin, towards, seen = camera.look_through(*place)
-    origin = camera.center + camera.rotation.T @ origin + dr.zeros(t.Array3f, width * height)
-    towards, far = dr.normalize(camera.rotation.T @ towards), dr.full(t.Float, dr.inf, len(pixel))
-    color, rest = splats.composite_segment(Segment(origin, towards, far, (far > 0) & seen))
+    if key not in kept:
+        pipeline = with_effects(pipeline_of(approximations, sh_degree), gaussians, camera)
+        rows = replace(rows, logit_opacities=dr.select(visible, rows.logit_opacities, -dr.inf))
+        splats = RaySplats.from_gaussians(pipeline.rows(rows), sh_degree, pipeline.model.cutoffs)
+        row, column = (each.ravel() + 0.5 for each in np.indices((height, width)))
+        origin, towards, seen = camera.look_through(t.Float(column), t.Float(row))
+        origin = camera.center + camera.rotation.T @ origin + dr.zeros(t.Array3f, len(row))
+        towards, far = dr.normalize(camera.rotation.T @ towards), dr.full(t.Float, dr.inf, len(row))
+        color, rest = splats.composite_segment(Segment(origin, towards, far, (far > 0) & seen))
+        kept[key] = np.array([np.array(plane) for plane in (rest, *color)], np.float64)
     count, low_pass = approximations.order_window, approximations.low_pass
     sharp, filtered = planes(0.0, count), planes(low_pass, count)
     changes = [
         np.square(planes(size, max(count // 2, 1)) - one).sum()
         for size, one in ((low_pass, filtered), (0.0, sharp))
     ]
-    rest, *color = sharp - np.array([np.array(plane) for plane in (rest, *color)], np.float64)
+    rest, *color = sharp - kept[key]
     square = max(float(np.mean(np.square(color + white * rest))) for white in (0, 1))
     return square * float(min(changes[0] / max(changes[1], 1e-20), 1.0) if low_pass else 1.0)
 
@@ -231,7 +232,7 @@ def meet_error_budget(
                 for one in alone
             ]
             drawer = SceneRenderer(copy, scene, list(zip(cameras, alone, strict=True)))
-            residual = partial(ray_residual, dr.detach(copy.gaussians), copy.sh_degree)
+            residual = partial(ray_residual, dr.detach(copy.gaussians), copy.sh_degree, {})
             renderer = Renderer(drawer.draw, splats.given_approximations, residual)
             report = splats.budget_report = Search(renderer, cameras, budget).choose(budget)
     except ValueError as error:
