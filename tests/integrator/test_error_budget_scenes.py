@@ -241,10 +241,10 @@ def test_rays_measure_the_error_of_the_most_accurate_image_among_giants(count, w
     for value, exact in zip((0.0, 1.0), truth, strict=True):
         renderer = error_budget.renderer_of(on_device, values, 0, 3 * (value,))
         errors.append(np.mean((renderer.image(camera) - exact) ** 2))
-    residual = partial(error_budget.ray_residual, on_device, 0, camera, WHOLE)
+    residual = partial(error_budget.ray_residual, on_device, 0, {}, camera, WHOLE)
     assert max(errors) > 1e-4**2
     assert residual(values) == pytest.approx(max(errors), rel=0.02)
-    assert error_budget.ray_residual(HAZE.to(llvm.TensorXf), 0, camera, WHOLE, values) == 0
+    assert error_budget.ray_residual(HAZE.to(llvm.TensorXf), 0, {}, camera, WHOLE, values) == 0
 
 
 def test_an_inaccurate_most_accurate_image_is_reported():
