@@ -28,7 +28,7 @@ J: both are those of the mean. The mean's place is therefore taken as constant i
 the moments are also the derivatives with respect to the mean's place, which densification uses.
 Rays depend on the lens, and on the motion: see :meth:`LensRayFalloff.along`.
 
-**Extent.** The rays at which alpha is the smallest are an elliptic cone. Eight of them are seen on
+**Extent.** The rays at which alpha is the smallest are an elliptic cone. Sixteen of them are seen on
 the film; an ellipse through these, enlarged by their deviations from it, is the outline.
 """
 
@@ -63,8 +63,8 @@ from drgs.splatting.footprint import (
 from drgs.splatting.grid import Lanes
 from drgs.splatting.projection import FilmShape, GaussianRows, RayTerms, Splats2D, factor_conic
 
-NUM_OUTLINE_POINTS = 8
-MAX_OUTLINE_DEVIATION = 4.0  # of the farthest point from the nearest; beyond, there is no outline
+NUM_OUTLINE_POINTS = 16
+MAX_OUTLINE_DEVIATION = 1.5  # of the farthest point from the nearest; beyond, there is no outline
 OUTLINE_MARGIN = 0.01  # of rounding
 MIN_OUTLINE_VARIANCE = 1e-4  # px^2
 

@@ -34,6 +34,7 @@ NO_CUTS = rays.ImageModel(
 )  # fmt: skip
 MAX_PAIRS = 2_000_000  # of pixels and Gaussians at a time
 DEGREE = 1
+FISHEYE_ANGLE = 0.95 * np.pi  # between the axis and means that are shown
 BACKGROUND = (0.2, 0.5, 0.8)
 
 
@@ -155,6 +156,8 @@ class Kind:
     def _of_rays(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         values = {k: v.astype(np.float32).astype(np.float64) for k, v in self.gaussians.items()}
         gaussians = Gaussians(**values)
+        kept = self._are_shown(gaussians, origins, directions)
+        gaussians = Gaussians(*(array[kept] for array in vars(gaussians).values()))
         rows = max(1, MAX_PAIRS // (len(gaussians.means) * origins.shape[1]))
         return np.concatenate(
             [
@@ -166,8 +169,6 @@ class Kind:
     def _part(
         self, gaussians: Gaussians, origins: np.ndarray, directions: np.ndarray
     ) -> np.ndarray:
-        kept = self._before_near_plane(gaussians, origins, directions)
-        gaussians = Gaussians(*(array[kept] for array in vars(gaussians).values()))
         if self.wall is None:
             shown = rays.render_along(
                 gaussians, origins, directions, background=BACKGROUND, model=NO_CUTS
@@ -196,11 +197,17 @@ class Kind:
         share = hit.reshape(height, 8, width, 8).mean(axis=(1, 3))
         return (share == 0) | (share == 1)
 
-    def _before_near_plane(
+    def _are_shown(
         self, gaussians: Gaussians, origins: np.ndarray, directions: np.ndarray
     ) -> np.ndarray:
-        if self.lens != "pinhole":
+        """Return whether the lens shows the means: others are not drawn, by any approximation."""
+        if self.lens == "equirectangular":
             return np.ones(len(gaussians.means), bool)
+        if self.lens == "fisheye":
+            axis = directions.sum(axis=(0, 1))
+            offsets = gaussians.means - origins[0, 0]
+            cosines = offsets @ axis / np.linalg.norm(offsets, axis=1) / np.linalg.norm(axis)
+            return cosines > np.cos(FISHEYE_ANGLE)
         # Along the optical axis, which all directions advance by 1: least squares.
         flat = directions.reshape(-1, 3)
         axis = np.linalg.lstsq(flat, np.ones(len(flat)), rcond=None)[0]
