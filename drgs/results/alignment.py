@@ -26,7 +26,9 @@ from scipy import ndimage
 from drgs.datasets.types import View
 
 SIGMA_PX = 1.0  # of the blur before the derivatives, so that they hold for shifts of a pixel
-NUM_MOVES, NUM_REWEIGHTINGS = 4, 4
+NUM_MOVES, NUM_REWEIGHTINGS = 4, 4  # at most; and of each regression
+MIN_MOVE_PX = 0.03  # of the corners; smaller moves are the last
+MEDIAN_STRIDE = 7  # one in so many differences is among those whose median is taken
 MIN_SIDE_PX = 8  # of an image; smaller ones are not aligned
 MIN_COVERED = 0.5  # share of the image; a rendering that is moved farther is not aligned
 MAX_MOVE = 0.25  # of corners, half diagonals: farther ones are found where nothing is alike
@@ -60,15 +62,16 @@ def align(
     behind a transparent photograph, display space, has no gain. Where the numbers do not make the
     images more alike, there are gains alone, by least squares, and in images below 8 px nothing.
     """
-    photograph = np.asarray(view.image, np.float64)
+    photograph = np.asarray(view.image, np.float32)
     height, width, _ = photograph.shape
-    counts = np.ones((height, width)) if view.mask is None else np.asarray(view.mask, np.float64)
-    behind = np.zeros(3)
+    counts = np.asarray(1.0 if view.mask is None else view.mask, np.float32)
+    counts = np.broadcast_to(counts, (height, width))
+    behind = np.zeros(3, np.float32)
     if view.alpha is not None:
-        behind = (1 - np.asarray(view.alpha, np.float64)[..., None]) * np.array(background)
+        behind = np.float32(background) * (1 - np.asarray(view.alpha, np.float32)[..., None])
     blur = SIGMA_PX, SIGMA_PX, 0
     blurred = ndimage.gaussian_filter(photograph, blur)
-    image, moved, gains = np.asarray(rendering, np.float64), np.zeros(4), np.zeros(3)
+    image, moved, gains = np.asarray(rendering, np.float32), np.zeros(4), np.zeros(3)
     before = _mean_error(photograph - image, counts)
     for _ in range(NUM_MOVES if min(height, width) >= MIN_SIDE_PX else 0):
         at, _ = _move(image, moved)
@@ -76,7 +79,9 @@ def align(
         base = ndimage.gaussian_filter(at - behind, blur)
         directions = _directions(smooth, base)
         numbers = _fit_numbers(directions, blurred - smooth, counts)
-        gains, moved = numbers[:3], moved + numbers[3:]
+        gains, moved = numbers[:3].astype(np.float32), moved + numbers[3:]
+        if np.abs(numbers[3:]).max() < MIN_MOVE_PX:
+            break
     at, is_covered = _move(image, moved)
     seen, left, others = counts * is_covered, photograph - at - gains * (at - behind), np.zeros(8)
     error = toned = _mean_error(left, seen)
@@ -84,7 +89,8 @@ def align(
         base = (1 + gains) * (at - behind)
         smooth = ndimage.gaussian_filter(left, blur)
         others = _fit_numbers(_other_directions(base, at, blur), smooth, seen)
-        further = left - _other_directions(base, at, (0, 0, 0))[..., :3] @ others[:3]
+        tones = zip(others, _tone_directions(base, at), strict=False)
+        further = left - sum(number * direction for number, direction in tones)
         if (after := _mean_error(further, seen)) < error:
             left, toned = further, after
     farthest = max(np.abs(moved).max(), np.abs(others[3:]).max()) / (np.hypot(width, height) / 2)
@@ -112,7 +118,7 @@ def align(
 
 def _mean_error(difference: np.ndarray, counts: np.ndarray) -> float:
     """Return the mean square of differences (H, W, 3); counts: weights (H, W)."""
-    squares = np.square(difference).mean(axis=2)
+    squares = np.square(difference).mean(axis=2, dtype=np.float64)
     return float((squares * counts).sum() / max(counts.sum(), 1e-10))
 
 
@@ -127,9 +133,9 @@ def _mean_step(image: np.ndarray, counts: np.ndarray) -> float:
 
 
 def _coordinates(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y from the middle, (H, W), in units of half the diagonal."""
-    y, x = np.mgrid[:height, :width]
-    size = np.hypot(width, height) / 2
+    """Return x and y from the middle, (H, W) float32, in units of half the diagonal."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    size = float(np.hypot(width, height)) / 2
     return (x + 0.5 - width / 2) / size, (y + 0.5 - height / 2) / size
 
 
@@ -153,41 +159,55 @@ def _move(image: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _directions(image: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Return the derivatives of an image (H, W, 3) along the numbers, (H, W, 3, 7)."""
-    x, y = _coordinates(*image.shape[:2])
-    x, y = x[..., None], y[..., None]
+    """Return the derivatives of an image (H, W, 3) along the numbers, (7, H, W, 3)."""
+    x, y = (each[..., None] for each in _coordinates(*image.shape[:2]))
     dy, dx = np.gradient(image, axis=(0, 1))
-    gains = base[..., None] * np.eye(image.shape[2])
-    others = np.stack([dx, dy, x * dx + y * dy, x * dy - y * dx], axis=-1)
-    return np.concatenate([gains, others], axis=-1)
+    directions = np.zeros((7, *image.shape), np.float32)
+    for channel in range(3):
+        directions[channel, ..., channel] = base[..., channel]
+    directions[3:] = dx, dy, x * dx + y * dy, x * dy - y * dx
+    return directions
+
+
+def _tone_directions(base: np.ndarray, image: np.ndarray) -> list[np.ndarray]:
+    """Return derivatives (H, W, 3) along gain, vignetting and response."""
+    x, y = (each[..., None] for each in _coordinates(*base.shape[:2]))
+    return [base, base * (x * x + y * y), base * np.log(np.clip(image, DARKEST, 1))]
 
 
 def _other_directions(
     base: np.ndarray, image: np.ndarray, blur: tuple[float, float, float]
 ) -> np.ndarray:
-    """Return derivatives (H, W, 3, 8).
+    """Return derivatives (8, H, W, 3).
 
     They are along gain, vignetting, response, zoom, distortion, two skews, and a rotation, which
     has explained a part of the skews.
     """
     x, y = (each[..., None] for each in _coordinates(*base.shape[:2]))
-    s, tones = x * x + y * y, np.log(np.clip(image, DARKEST, 1))
-    gains = [ndimage.gaussian_filter(base * each, blur) for each in (np.ones_like(s), s, tones)]
+    tones = [ndimage.gaussian_filter(each, blur) for each in _tone_directions(base, image)]
     dy, dx = np.gradient(ndimage.gaussian_filter(image, blur), axis=(0, 1))
     outward = x * dx + y * dy
-    numbers = [*gains, outward, s * outward, y * dx, y * dy, x * dy - y * dx]
-    return np.stack(numbers, axis=-1)
+    lens = outward, (x * x + y * y) * outward, y * dx, y * dy, x * dy - y * dx
+    return np.stack([*tones, *lens])
 
 
 def _fit_numbers(directions: np.ndarray, difference: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the numbers (7,) of the robust regression; counts: weights (H, W)."""
-    a = directions.reshape(-1, directions.shape[-1])
-    b, given = difference.ravel(), np.repeat(counts.ravel(), difference.shape[-1])
-    weights, numbers = given, np.zeros(a.shape[1])
+    """Return the numbers (K,) of the robust regression.
+
+    directions: (K, H, W, 3); difference: (H, W, 3); counts: weights (H, W).
+    """
+    # Row by row, products are too small for threads of BLAS, of which each caller's would have its
+    # own.
+    a = directions.reshape(*directions.shape[:2], -1).transpose(1, 0, 2)  # (H, K, 3 W)
+    b, given = difference.reshape(len(a), -1), np.repeat(counts, difference.shape[-1], axis=1)
+    weights, is_counted = given, given.ravel()[::MEDIAN_STRIDE] > 0
+    numbers = np.zeros(a.shape[1])
     for _ in range(NUM_REWEIGHTINGS):
-        normal = (a * weights[:, None]).T @ a + 1e-9 * np.eye(a.shape[1])
-        numbers = np.linalg.solve(normal, a.T @ (weights * b))
-        left = np.abs(b - a @ numbers)
-        deviation = 1.4826 * np.median(left[given > 0]) if given.any() else 0.0
+        weighted = a * weights[:, None]
+        normal = (weighted @ a.transpose(0, 2, 1)).sum(0, np.float64) + 1e-9 * np.eye(a.shape[1])
+        numbers = np.linalg.solve(normal, (weighted @ b[..., None]).sum(0, np.float64)[:, 0])
+        left = np.abs(b - numbers.astype(np.float32) @ a)
+        some = left.ravel()[::MEDIAN_STRIDE][is_counted]
+        deviation = 1.4826 * float(np.median(some)) if some.size else 0.0
         weights = given / (1 + np.square(left / (2 * deviation + MIN_DEVIATION)))
     return numbers
