@@ -75,9 +75,10 @@ class ShortFit:
     images: Sequence[np.ndarray]  # (H, W, 3) display space: renderings of the held-out views
     alignments: Sequence[Alignment]  # of these
     factor: int  # px of the dataset's photographs in one of the fit's
-    wall_s: float  # of its iterations
-    trained: Sequence[Alignment] = ()  # of the first fold's training views; without effects alone
+    wall_s: float  # of its iterations, in the first fold
+    trained: Sequence[Alignment] = ()  # of the first fold's training views, where they are needed
     trained_images: Sequence[np.ndarray] = ()  # (H, W, 3) display space, of these
+    num_folds: int = 1
 
     @property
     def psnr(self) -> np.ndarray:

@@ -65,6 +65,11 @@ class Decision:
     advice: str = ""  # where they are not chosen, or there are none
     chosen: bool = False
 
+    @property
+    def is_settled(self) -> bool:
+        """Whether more photographs would not change it: it is chosen, or nothing is gained."""
+        return self.chosen or self.gain is None or self.gain <= 0
+
 
 @dataclass(frozen=True)
 class Examination:
@@ -154,8 +159,8 @@ def examine(
     if mi.variant() is None:
         select_variant(VARIANTS[0])
     try:
-        short, folds, smaller = short_fits.plan_short_fits(short, folds, end)
-        base = short_fits.fit_folds(short, folds, factor, partial(progress, "baseline"), end, True)
+        short, smaller = short_fits.plan_short_fits(short, folds[0], end)
+        base = short_fits.fit_fold(short, folds, factor, partial(progress, "baseline"), end, True)
     except short_fits.OutOfTimeError:
         note = f"short fits take longer than the {seconds:.0f} s that --budget leaves for them"
         return Examination((), 0, time.perf_counter() - started, note)
@@ -168,7 +173,7 @@ def examine(
             continue
         decision, base = _try(finding, base, folds, partial(progress, finding.effect), end)
         decisions.append(decision)
-    num_held_out = sum(len(fold.test) for fold in folds)
+    num_held_out = sum(len(fold.test) for fold in folds[: base.num_folds])
     wall_s = time.perf_counter() - started
     return Examination(tuple(decisions), num_held_out, wall_s, smaller=smaller)
 
@@ -187,13 +192,17 @@ def _try(
     progress: Callable[[int, int], None],
     end: float,
 ) -> tuple[Decision, ShortFit]:
-    """Return the decision about a finding, and the fit beside which the next one is tried."""
+    """Return the decision about a finding, and the fit beside which the next one is tried.
+
+    A fold after the first is fitted while the effect gains, but not enough.
+    """
     if not finding.is_likely:
         return _reject(finding), base
+    with_trained = finding.max_loss is not None  # coefficients show in all photographs
     try:
         short_fits.check_time(end - base.wall_s)
         changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
-        tried = short_fits.fit_folds(changed, folds, base.factor, progress, end)
+        tried = short_fits.fit_fold(changed, folds, base.factor, progress, end, with_trained)
     except short_fits.OutOfTimeError:
         return _reject(finding, "; no time was left to try it"), base
     except (ValidationError, UserError, NonFiniteError) as error:
@@ -201,7 +210,17 @@ def _try(
     confirmed = finding if finding.confirm is None else finding.confirm(tried)
     if confirmed is None:
         return _reject(finding, "; a fit with it does not confirm it"), base
-    decision = decide(confirmed, base, tried)
+    decision = decide(confirmed, base, tried, len(folds))
+    while not decision.is_settled and tried.num_folds < len(folds):
+        try:
+            short_fits.check_time(end - 2 * base.wall_s)
+            if base.num_folds == tried.num_folds:
+                base = short_fits.add_fold(base, folds, progress, end)
+            tried = short_fits.add_fold(tried, folds, progress, end)
+        except short_fits.OutOfTimeError:
+            text = f"{decision.evidence}; no time was left for more photographs"
+            return replace(decision, evidence=text), base
+        decision = decide(confirmed, base, tried, len(folds))
     return decision, tried if decision.chosen else base
 
 
@@ -209,8 +228,11 @@ def _left_out(changes: Mapping[str, object]) -> list[str]:
     return cast("list[str]", changes.get("data.leave_out", []))
 
 
-def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
+def decide(finding: Finding, without: ShortFit, fitted: ShortFit, num_looks: int = 1) -> Decision:
     """Return the decision about an effect from two short fits: the second one simulates it.
+
+    num_looks: so often it may be decided, after one fold and after more. Each decision has its
+    share of the chance of a false alarm (Bonferroni).
 
     The gain is the median of the mean gains of all pairs of held-out photographs, by ranks (Hodges
     and Lehmann 1963), which a few that differ do not move, nor do they spread it. It counts where
@@ -233,9 +255,10 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
     if finding.max_loss is not None:
         chosen = gain > -finding.max_loss
     else:
-        alone = any(_counts(gains[each], 1 - (1 - CONFIDENCE) / len(cameras)) for each in cameras)
+        chance = (1 - CONFIDENCE) / num_looks
+        alone = any(_counts(gains[each], chance / len(cameras)) for each in cameras)
         agree = all(middle_of(gains[each])[0] > -MIN_GAIN_DB for each in cameras)
-        chosen = _counts(gains, CONFIDENCE) or (alone and agree)
+        chosen = _counts(gains, chance) or (alone and agree)
     cost = fitted.wall_s / without.wall_s
     return replace(_reject(finding), gain=gain, spread=spread, cost=cost, chosen=chosen)
 
@@ -253,14 +276,14 @@ def middle_of(gains: np.ndarray) -> tuple[float, float]:
     return float(np.median(means)), float(np.diff(means[ends])[0] / 2)
 
 
-def _counts(gains: np.ndarray, confidence: float) -> bool:
+def _counts(gains: np.ndarray, max_chance: float) -> bool:
     middle, _ = middle_of(gains)
     order = np.argsort(np.abs(gains - middle), kind="stable")
     kept = gains[order[: len(gains) - int(TRIMMED * len(gains))]]
     if middle <= MIN_GAIN_DB:  # ranks of zeros have no deviation
         return False
     _, chance = cast("tuple[float, float]", wilcoxon(kept, alternative="greater"))
-    return bool(chance <= 1 - confidence)
+    return bool(chance <= max_chance)
 
 
 def _reject(finding: Finding, reason: str = "") -> Decision:

@@ -24,7 +24,7 @@ from drgs.training.trainer import Trainer
 
 SHORT_FIT_WIDTH_PX = 135  # about: of photographs in short fits
 NUM_GAUSSIANS = 15_000
-SHARE_OF_ITERATIONS, MAX_ITERATIONS, MIN_ITERATIONS = 1 / 6, 500, 250
+SHARE_OF_ITERATIONS, MAX_ITERATIONS, MIN_ITERATIONS = 1 / 6, 300, 250
 """A short fit has this share of the fit's iterations, within these bounds; a fit that is shorter
 than six times the least is not examined."""
 
@@ -33,7 +33,8 @@ MIN_ITERATIONS_OF_FIT = round(MIN_ITERATIONS / SHARE_OF_ITERATIONS)
 MAX_VIEWS = 160  # photographs of an examination
 NUM_HELD_OUT, HELD_OUT_STRIDE, FEW_HELD_OUT = 10, (4, 8), 20
 """Photographs that are left out, about: one in four to one in eight. Below 50 photographs, so many
-folds leave out others that there are 20: of 20 photographs, each is left out once."""
+folds leave out others that there are 20: of 20 photographs, each is left out once. Folds after the
+first are fitted for an effect that it leaves undecided."""
 
 WARM_UP_ITERATIONS = 20  # of a short fit, whose time does not count: kernels are compiled
 
@@ -52,16 +53,14 @@ def check_time(end: float) -> None:
         raise OutOfTimeError
 
 
-def plan_short_fits(
-    config: FitConfig, folds: Sequence[Dataset], end: float
-) -> tuple[FitConfig, Sequence[Dataset], str]:
-    """Return iterations and folds for which there is time, and what was made smaller.
+def plan_short_fits(config: FitConfig, fold: Dataset, end: float) -> tuple[FitConfig, str]:
+    """Return the configuration with iterations for which there is time, and what was made smaller.
 
     config: of a short fit. Raises :class:`OutOfTimeError` if there is no time for the least.
     """
     if end == math.inf:
-        return config, folds, ""
-    trainer, started = _make_trainer(config, folds[0]), 0.0
+        return config, ""
+    trainer, started = _make_trainer(config, fold), 0.0
     for done in range(WARM_UP_ITERATIONS + TIMED_ITERATIONS):
         check_time(end)
         if done == WARM_UP_ITERATIONS:
@@ -72,20 +71,18 @@ def plan_short_fits(
     now = time.perf_counter()
     trainer.release()
     possible = int((end - now) / NUM_FITS / GROWTH / (now - started) * TIMED_ITERATIONS)
-    iterations, count = min(possible, config.iterations), max(1, possible // config.iterations)
     if possible < MIN_ITERATIONS:
         raise OutOfTimeError
-    if iterations == config.iterations and count >= len(folds):
-        return config, folds, ""
-    text = f"{iterations} of {config.iterations} iterations, {min(count, len(folds))} folds"
-    return with_iterations(config, iterations), folds[:count], text
+    if possible >= config.iterations:
+        return config, ""
+    text = f"{possible} of {config.iterations} iterations"
+    return with_iterations(config, possible), text
 
 
 def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
     """Return folds of the training photographs, small, and their divisor.
 
-    ``test`` of each fold are photographs that it leaves out; the first fold alone, unless
-    photographs are few.
+    ``test`` of each fold are photographs that it leaves out; one fold, unless photographs are few.
     """
     views = evenly_spaced(dataset.train, MAX_VIEWS)
     factor = max(1, round(max(view.width for view in views) / SHORT_FIT_WIDTH_PX))
@@ -102,7 +99,7 @@ def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
     return folds, factor
 
 
-def fit_folds(
+def fit_fold(
     config: FitConfig,
     folds: Sequence[Dataset],
     factor: int,
@@ -110,30 +107,31 @@ def fit_folds(
     end: float = math.inf,
     with_trained: bool = False,
 ) -> ShortFit:
-    """Fit the training views of each fold, and render its test views; config: of a short fit.
+    """Fit the training views of the first fold, and render its test views; config: of a short fit.
 
-    Photographs that it leaves out are fitted in no fold, and tested in the first. with_trained:
-    render the training views of the first fold as well.
+    Photographs that the configuration leaves out are tested. with_trained: render the training
+    views as well.
 
     Raises :class:`OutOfTimeError` after ``end``, by ``time.perf_counter``.
     """
-    left_out, fits = {*config.data.leave_out}, []
-    for number, fold in enumerate(folds):
-        train = tuple(view for view in fold.train if view.name not in left_out)
-        others = () if number else tuple(view for view in fold.train if view.name in left_out)
-        split = replace(fold, train=train, test=(*fold.test, *others))
+    left_out = {*config.data.leave_out}
+    others = tuple(view for view in folds[0].train if view.name in left_out)
+    first = replace(folds[0], test=(*folds[0].test, *others))
+    return _short_fit(config, first, factor, progress, end, with_trained)
 
-        def step(done: int, before: int = number * config.iterations) -> None:
-            progress(before + done, config.iterations * len(folds))
-            check_time(end)
 
-        fits.append(_short_fit(config, split, factor, step, with_trained and number == 0))
+def add_fold(
+    fit: ShortFit, folds: Sequence[Dataset], progress: Callable[[int, int], None], end: float
+) -> ShortFit:
+    """Return a fit with the test views of the next fold; the same errors."""
+    fold = folds[fit.num_folds]
+    more = _short_fit(fit.config, fold, fit.factor, progress, end, False)
     return replace(
-        fits[0],
-        dataset=replace(fits[0].dataset, test=tuple(v for fit in fits for v in fit.dataset.test)),
-        images=[image for fit in fits for image in fit.images],
-        alignments=[alignment for fit in fits for alignment in fit.alignments],
-        wall_s=sum(fit.wall_s for fit in fits),
+        fit,
+        dataset=replace(fit.dataset, test=(*fit.dataset.test, *more.dataset.test)),
+        images=[*fit.images, *more.images],
+        alignments=[*fit.alignments, *more.alignments],
+        num_folds=fit.num_folds + 1,
     )
 
 
@@ -141,15 +139,19 @@ def _short_fit(
     config: FitConfig,
     split: Dataset,
     factor: int,
-    after_step: Callable[[int], None],
+    progress: Callable[[int, int], None],
+    end: float,
     with_trained: bool,
 ) -> ShortFit:
-    split = with_background(split, config)
+    left_out = {*config.data.leave_out}
+    train = tuple(view for view in split.train if view.name not in left_out)
+    split = with_background(replace(split, train=train), config)
     trainer = _make_trainer(config, split)
     started = time.perf_counter()
     while trainer.iteration < config.iterations:
         trainer.step()
-        after_step(trainer.iteration)
+        progress(trainer.iteration, config.iterations)
+        check_time(end)
         if trainer.iteration == WARM_UP_ITERATIONS:
             dr.sync_thread()
             started = time.perf_counter()

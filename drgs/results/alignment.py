@@ -68,7 +68,9 @@ def align(
     counts = np.broadcast_to(counts, (height, width))
     behind = np.zeros(3, np.float32)
     if view.alpha is not None:
-        behind = np.float32(background) * (1 - np.asarray(view.alpha, np.float32)[..., None])
+        behind = np.asarray(background, np.float32) * (
+            1 - np.asarray(view.alpha, np.float32)[..., None]
+        )
     blur = SIGMA_PX, SIGMA_PX, 0
     blurred = ndimage.gaussian_filter(photograph, blur)
     image, moved, gains = np.asarray(rendering, np.float32), np.zeros(4), np.zeros(3)

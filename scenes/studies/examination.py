@@ -435,7 +435,9 @@ def main() -> None:
     parser.add_argument("--only", choices=("alarms", "fits"))
     parser.add_argument("--rows", type=Path, default=ROWS, help="CSV file of table 1, continued")
     parser.add_argument("--effect", help="measure this one alone")
-    parser.add_argument("--seeds", default=f"0:{NUM_CASES}", metavar="FIRST:END", help="random ones")
+    parser.add_argument(
+        "--seeds", default=f"0:{NUM_CASES}", metavar="FIRST:END", help="random ones"
+    )
     args = parser.parse_args()
     seeds = range(*map(int, args.seeds.split(":")))
     warnings.simplefilter("ignore")
