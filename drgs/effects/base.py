@@ -76,7 +76,7 @@ class ShortFit:
     alignments: Sequence[Alignment]  # of these
     factor: int  # px of the dataset's photographs in one of the fit's
     wall_s: float  # of its iterations, in the first fold
-    trained: Sequence[Alignment] = ()  # of the first fold's training views, where they are needed
+    trained: Sequence[Alignment] = ()  # of the first fold's training views; without effects alone
     trained_images: Sequence[np.ndarray] = ()  # (H, W, 3) display space, of these
     num_folds: int = 1
 
@@ -84,11 +84,6 @@ class ShortFit:
     def psnr(self) -> np.ndarray:
         """The held-out views' PSNR, (V,) dB, with the differences of a camera removed."""
         return np.array([alignment.psnr for alignment in self.alignments])
-
-    @property
-    def toned_psnr(self) -> np.ndarray:
-        """The same, also without vignetting and response."""
-        return np.array([alignment.toned_psnr for alignment in self.alignments])
 
 
 @dataclass(frozen=True)
@@ -103,7 +98,7 @@ class Finding:
     advice: str = ""  # what to do where it is not chosen; in place of changes, if no fit has any
     confirm: Callable[[ShortFit], Finding | None] | None = None
     """Returns the finding with the evidence of the fit that has the effect; None: it has none."""
-    max_loss: float | None = None  # dB, of what is confirmed; None: it is chosen by its gain
+    is_measured: bool = False  # whether the evidence is enough to choose it, without such a fit
 
 
 Progress = Callable[[str, int, int], None]  # what is tried, iterations done, and of how many

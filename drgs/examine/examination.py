@@ -97,7 +97,7 @@ class Examination:
     def reasons(self) -> dict[str, str]:
         """The evidence for each of these, by key."""
         return {
-            key: f"{decision.evidence}: {decision.gain:+.2f} dB"
+            key: decision.evidence + (f": {decision.gain:+.2f} dB" if decision.gain else "")
             for decision in self.decisions
             for key in decision.changes
             if decision.chosen
@@ -181,7 +181,7 @@ def examine(
 def _resemblance(fit: ShortFit) -> float:
     """Return the middle share of training photographs' variance that aligned renderings explain."""
     pairs = zip(fit.dataset.train, fit.trained, strict=True)
-    left = [10 ** (-one.toned_psnr / 10) / np.var(np.asarray(view.image)) for view, one in pairs]
+    left = [10 ** (-one.psnr / 10) / np.var(np.asarray(view.image)) for view, one in pairs]
     return float(1 - np.median(left))
 
 
@@ -196,13 +196,12 @@ def _try(
 
     A fold after the first is fitted while the effect gains, but not enough.
     """
-    if not finding.is_likely:
-        return _reject(finding), base
-    with_trained = finding.max_loss is not None  # coefficients show in all photographs
+    if not finding.is_likely or finding.is_measured:
+        return replace(_reject(finding), chosen=finding.is_likely), base
     try:
         short_fits.check_time(end - base.wall_s)
         changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
-        tried = short_fits.fit_fold(changed, folds, base.factor, progress, end, with_trained)
+        tried = short_fits.fit_fold(changed, folds, base.factor, progress, end)
     except short_fits.OutOfTimeError:
         return _reject(finding, "; no time was left to try it"), base
     except (ValidationError, UserError, NonFiniteError) as error:
@@ -238,12 +237,9 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit, num_looks: int
     and Lehmann 1963), which a few that differ do not move, nor do they spread it. It counts where
     it does over all photographs, or over those of one camera while others do not lose.
     """
-    pairs = (without.psnr, fitted.psnr)
-    if finding.max_loss is not None:  # renderings of held-out views have no vignetting
-        pairs = (without.toned_psnr, fitted.toned_psnr)
     before, after = (
-        {view.name: psnr for view, psnr in zip(fit.dataset.test, values, strict=True)}
-        for fit, values in zip((without, fitted), pairs, strict=True)
+        {view.name: psnr for view, psnr in zip(fit.dataset.test, fit.psnr, strict=True)}
+        for fit in (without, fitted)
     )
     kept = before.keys() - {*fitted.config.data.leave_out}
     views = [view for view in fitted.dataset.test if view.name in kept]
@@ -252,13 +248,10 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit, num_looks: int
     cameras = [np.array([key == other for other in keys]) for key in dict.fromkeys(keys)]
     cameras = [of_camera for of_camera in cameras if of_camera.sum() >= MIN_CAMERA_VIEWS]
     gain, spread = middle_of(gains)
-    if finding.max_loss is not None:
-        chosen = gain > -finding.max_loss
-    else:
-        chance = (1 - CONFIDENCE) / num_looks
-        alone = any(_counts(gains[each], chance / len(cameras)) for each in cameras)
-        agree = all(middle_of(gains[each])[0] > -MIN_GAIN_DB for each in cameras)
-        chosen = _counts(gains, chance) or (alone and agree)
+    chance = (1 - CONFIDENCE) / num_looks
+    alone = any(_counts(gains[each], chance / len(cameras)) for each in cameras)
+    agree = all(middle_of(gains[each])[0] > -MIN_GAIN_DB for each in cameras)
+    chosen = _counts(gains, chance) or (alone and agree)
     cost = fitted.wall_s / without.wall_s
     return replace(_reject(finding), gain=gain, spread=spread, cost=cost, chosen=chosen)
 
@@ -317,15 +310,9 @@ def _findings(fit: ShortFit) -> Iterator[Finding]:
     """Yield the findings of what is shipped and of installed extensions."""
     effects = sorted((extension.value for extension in EFFECTS.all()), key=lambda e: e.order)
     looks = [_look_for_background, look_for_bad_photographs, *(e.look_for for e in effects)]
-    _, share = _border_colors((*fit.dataset.train, *fit.dataset.test))
     for look in (*looks, look_for_moving_things):
         found = look(fit)
-        for one in [found] if isinstance(found, Finding) else found or ():
-            if one.effect == "vignetting" and one.is_likely and share >= MIN_BORDER_SHARE:
-                text = f"{one.evidence}, as before another background; photograph a wall to tell"
-                yield replace(one, evidence=text, is_likely=False)
-            else:
-                yield one
+        yield from [found] if isinstance(found, Finding) else found or ()
 
 
 def _border_colors(views: Sequence[View]) -> tuple[np.ndarray, float]:

@@ -24,7 +24,7 @@ from drgs.training.trainer import Trainer
 
 SHORT_FIT_WIDTH_PX = 135  # about: of photographs in short fits
 NUM_GAUSSIANS = 15_000
-SHARE_OF_ITERATIONS, MAX_ITERATIONS, MIN_ITERATIONS = 1 / 6, 300, 250
+SHARE_OF_ITERATIONS, MAX_ITERATIONS, MIN_ITERATIONS = 1 / 6, 400, 250
 """A short fit has this share of the fit's iterations, within these bounds; a fit that is shorter
 than six times the least is not examined."""
 

@@ -10,10 +10,9 @@ image. :func:`align` finds the seven numbers by least squares, again after movin
 them (Lucas and Kanade 1981), with weights by which pixels with other differences count little
 (Cauchy's, Holland and Welsch 1977). What is left, it regresses on
 
-    (a s + p log r) r + b (x s dr/dx + y s dr/dy) + y (m dr/dx + n dr/dy), s = x^2 + y^2,
+    b (x s dr/dx + y s dr/dy) + y (m dr/dx + n dr/dy), s = x^2 + y^2,
 
-with the vignetting a, the response r^exp(p), the distortion b and the skews m, n of rows that are
-read one after the other.
+with the distortion b and the skews m, n of rows that are read one after the other.
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ MIN_SIDE_PX = 8  # of an image; smaller ones are not aligned
 MIN_COVERED = 0.5  # share of the image; a rendering that is moved farther is not aligned
 MAX_MOVE = 0.25  # of corners, half diagonals: farther ones are found where nothing is alike
 MIN_DEVIATION = 1e-6  # of the remaining differences, display space
-DARKEST = 0.02  # of colours whose logarithm is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +41,12 @@ class Alignment:
     gains: np.ndarray  # (3,): the photograph's brightness relative to the rendering's, minus 1
     shift: np.ndarray  # (2,) px: from the rendering's content to the photograph's
     psnr: float  # dB, of the rendering without these differences
-    toned_psnr: float  # dB, also without vignetting and response
-    vignetting: float  # brightness of corners relative to the middle's, minus 1
-    response: float  # logarithm of the exponent by which the photograph's colours differ
     zoom: float  # px at half the diagonal
     distortion: float  # px at half the diagonal, beyond the zoom
     skew: np.ndarray  # (2,) px at half the diagonal: shift of lower rows
     sharpness: float  # logarithm of the photograph's steps between pixels over the rendering's
-    left: np.ndarray  # (H, W) float32: RMS difference of each pixel that remains, masked ones 0
+    left: np.ndarray  # (H, W) float32: RMS difference of each pixel that remains
+    """Pixels that are masked, or show the background alone, have 0."""
 
 
 def align(
@@ -66,8 +62,9 @@ def align(
     height, width, _ = photograph.shape
     counts = np.asarray(1.0 if view.mask is None else view.mask, np.float32)
     counts = np.broadcast_to(counts, (height, width))
-    behind = np.zeros(3, np.float32)
+    behind, is_opaque = np.zeros(3, np.float32), True
     if view.alpha is not None:
+        is_opaque = np.asarray(view.alpha) > 0
         behind = np.asarray(background, np.float32) * (
             1 - np.asarray(view.alpha, np.float32)[..., None]
         )
@@ -85,36 +82,28 @@ def align(
         if np.abs(numbers[3:]).max() < MIN_MOVE_PX:
             break
     at, is_covered = _move(image, moved)
-    seen, left, others = counts * is_covered, photograph - at - gains * (at - behind), np.zeros(8)
-    error = toned = _mean_error(left, seen)
+    seen, left, others = counts * is_covered, photograph - at - gains * (at - behind), np.zeros(5)
+    error = _mean_error(left, seen)
     if min(height, width) >= MIN_SIDE_PX:
-        base = (1 + gains) * (at - behind)
         smooth = ndimage.gaussian_filter(left, blur)
-        others = _fit_numbers(_other_directions(base, at, blur), smooth, seen)
-        tones = zip(others, _tone_directions(base, at), strict=False)
-        further = left - sum(number * direction for number, direction in tones)
-        if (after := _mean_error(further, seen)) < error:
-            left, toned = further, after
-    farthest = max(np.abs(moved).max(), np.abs(others[3:]).max()) / (np.hypot(width, height) / 2)
-    if is_covered.mean() < MIN_COVERED or farthest > MAX_MOVE or not toned < before:
-        moved, others = np.zeros(4), np.zeros(8)
+        others = _fit_numbers(_other_directions(at, blur), smooth, seen)
+    farthest = max(np.abs(moved).max(), np.abs(others).max()) / (np.hypot(width, height) / 2)
+    if is_covered.mean() < MIN_COVERED or farthest > MAX_MOVE or not error < before:
+        moved, others = np.zeros(4), np.zeros(5)
         at, seen, base = image, counts, image - behind
         weights = counts[..., None] * base * (min(height, width) >= MIN_SIDE_PX)
         gains = (weights * (photograph - image)).sum((0, 1)) / ((weights * base).sum((0, 1)) + 1e-9)
         left = photograph - image - gains * base
-        error = toned = _mean_error(left, seen)
+        error = _mean_error(left, seen)
     return Alignment(
         gains=gains,
         shift=moved[:2],
         psnr=-10 * float(np.log10(max(min(error, before), 1e-10))),
-        toned_psnr=-10 * float(np.log10(max(toned, 1e-10))),
-        vignetting=float(others[1]),
-        response=float(others[2]),
-        zoom=float(moved[2] + others[3]),
-        distortion=float(others[4]),
-        skew=others[5:7],
+        zoom=float(moved[2] + others[0]),
+        distortion=float(others[1]),
+        skew=others[2:4],
         sharpness=float(np.log(_mean_step(photograph, seen) / _mean_step(at, seen))),
-        left=(np.sqrt(np.square(left).mean(axis=2)) * seen).astype(np.float32),
+        left=(np.sqrt(np.square(left).mean(axis=2)) * seen * is_opaque).astype(np.float32),
     )
 
 
@@ -171,26 +160,15 @@ def _directions(image: np.ndarray, base: np.ndarray) -> np.ndarray:
     return directions
 
 
-def _tone_directions(base: np.ndarray, image: np.ndarray) -> list[np.ndarray]:
-    """Return derivatives (H, W, 3) along gain, vignetting and response."""
-    x, y = (each[..., None] for each in _coordinates(*base.shape[:2]))
-    return [base, base * (x * x + y * y), base * np.log(np.clip(image, DARKEST, 1))]
+def _other_directions(image: np.ndarray, blur: tuple[float, float, float]) -> np.ndarray:
+    """Return derivatives (5, H, W, 3).
 
-
-def _other_directions(
-    base: np.ndarray, image: np.ndarray, blur: tuple[float, float, float]
-) -> np.ndarray:
-    """Return derivatives (8, H, W, 3).
-
-    They are along gain, vignetting, response, zoom, distortion, two skews, and a rotation, which
-    has explained a part of the skews.
+    They are along zoom, distortion, two skews, and a rotation, which has explained a part of them.
     """
-    x, y = (each[..., None] for each in _coordinates(*base.shape[:2]))
-    tones = [ndimage.gaussian_filter(each, blur) for each in _tone_directions(base, image)]
+    x, y = (each[..., None] for each in _coordinates(*image.shape[:2]))
     dy, dx = np.gradient(ndimage.gaussian_filter(image, blur), axis=(0, 1))
     outward = x * dx + y * dy
-    lens = outward, (x * x + y * y) * outward, y * dx, y * dy, x * dy - y * dx
-    return np.stack([*tones, *lens])
+    return np.stack([outward, (x * x + y * y) * outward, y * dx, y * dy, x * dy - y * dx])
 
 
 def _fit_numbers(directions: np.ndarray, difference: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -28,20 +28,18 @@ def plan_for(monkeypatch):
         ticks = count()
         clock = SimpleNamespace(perf_counter=lambda: 0.1 * next(ticks))
         monkeypatch.setattr(short_fits, "time", clock)
-        config_then, folds_then, smaller = plan_short_fits(config, folds, seconds)
-        return config_then.iterations, len(folds_then), smaller
+        planned, smaller = plan_short_fits(config, folds[0], seconds)
+        return planned.iterations, smaller
 
     return plan
 
 
 def test_an_examination_is_as_large_as_there_is_time(plan_for):
-    assert plan_for(float("inf")) == plan_for(1000.0) == (500, 2, "")
+    assert plan_for(float("inf")) == plan_for(200.0) == (400, "")
     # 10 iterations look at the clock 10 times: 0.16 s each, as they grow; and two short fits.
-    iterations, folds, smaller = plan_for(200.0)
-    assert (iterations, folds, smaller) == (500, 1, "500 of 500 iterations, 1 folds")
-    iterations, folds, smaller = plan_for(120.0)
-    assert iterations == pytest.approx((120 - 3.2) / 2 / 0.16, abs=2) and folds == 1
-    assert smaller == f"{iterations} of 500 iterations, 1 folds"
+    iterations, smaller = plan_for(120.0)
+    assert iterations == pytest.approx((120 - 3.2) / 2 / 0.16, abs=2)
+    assert smaller == f"{iterations} of 400 iterations"
 
 
 @pytest.mark.parametrize("seconds", [80.0, 0.5])
