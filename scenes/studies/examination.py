@@ -306,6 +306,8 @@ def alarms(
                     yield NOTHING, 0.0, seed, folder, None
             for effect in EFFECTS:
                 usable = folders[:1] if effect.name == "background" else folders
+                if effect.name == "vignetting":  # of a thing in the middle, it cannot be told
+                    usable = [*folders[1:], Path(f"glossy@{seed}")]
                 for place in places:
                     folder = usable[seed % len(usable)]
                     yield effect.name, effect.strengths[place], seed, folder, effect
@@ -328,7 +330,7 @@ def measure_alarms(
         config, dataset = load(folder)
         bad: set[str] = set()
         if effect is not None:
-            other = load(folders[(folders.index(folder) + 1) % len(folders)])[1]
+            other = load(folders[(seed + 1) % len(folders)])[1]
             rng = np.random.default_rng(seed)
             dataset, bad = effect.spoil(dataset, strength, rng, other)
         found = drgs.examine(dataset, config.model_copy(update={"seed": seed}))
