@@ -67,8 +67,8 @@ class Decision:
 
     @property
     def is_settled(self) -> bool:
-        """Whether more photographs would not change it: it is chosen, or nothing is gained."""
-        return self.chosen or self.gain is None or self.gain <= 0
+        """Whether more photographs would not change it: it is chosen, or no gain that counts."""
+        return self.chosen or self.gain is None or self.gain <= MIN_GAIN_DB
 
 
 @dataclass(frozen=True)
