@@ -6,6 +6,7 @@ its part in a fit; its files; and its stage in an image, where it has one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -99,6 +100,12 @@ class Finding:
     confirm: Callable[[ShortFit], Finding | None] | None = None
     """Returns the finding with the evidence of the fit that has the effect; None: it has none."""
     is_measured: bool = False  # whether the evidence is enough to choose it, without such a fit
+
+
+def trimmed_deviation(values: np.ndarray) -> float:
+    """Return the root mean square of values, without the tenth of them that is largest."""
+    squares = np.sort(np.square(values))
+    return float(np.sqrt(squares[: len(squares) - math.ceil(len(squares) / 10)].mean()))
 
 
 Progress = Callable[[str, int, int], None]  # what is tried, iterations done, and of how many

@@ -29,7 +29,7 @@ from drgs.config.load import config_from
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError, one_line
-from drgs.datasets.types import Dataset, View
+from drgs.datasets.types import Dataset
 from drgs.effects.base import Finding, Progress, ShortFit
 from drgs.effects.photometry import camera_key
 from drgs.examine import short_fits
@@ -79,7 +79,6 @@ class Examination:
     num_held_out: int  # training photographs
     wall_s: float
     note: str = ""  # why nothing was examined, if so
-    smaller: str = ""  # what there was no time for
 
     @property
     def bad_photographs(self) -> list[str]:
@@ -97,7 +96,7 @@ class Examination:
     def reasons(self) -> dict[str, str]:
         """The evidence for each of these, by key."""
         return {
-            key: decision.evidence + (f": {decision.gain:+.2f} dB" if decision.gain else "")
+            key: decision.evidence + ("" if decision.gain is None else f": {decision.gain:+.2f} dB")
             for decision in self.decisions
             for key in decision.changes
             if decision.chosen
@@ -125,8 +124,7 @@ class Examination:
             for row in rows
         )
         title = f"examined in {self.wall_s:.0f} s, on {self.num_held_out} held-out views"
-        title += f" (within --budget: {self.smaller}):" if self.smaller else ":"
-        return "\n  ".join([title, *lines])
+        return "\n  ".join([f"{title}:", *lines])
 
 
 @EXAMINERS.register("short_fits")
@@ -159,8 +157,9 @@ def examine(
     if mi.variant() is None:
         select_variant(VARIANTS[0])
     try:
-        short, smaller = short_fits.plan_short_fits(short, folds[0], end)
-        base = short_fits.fit_fold(short, folds, factor, partial(progress, "baseline"), end, True)
+        base = short_fits.fit_fold(
+            short, folds, 0, factor, partial(progress, "baseline"), end, True
+        )
     except short_fits.OutOfTimeError:
         note = f"short fits take longer than the {seconds:.0f} s that --budget leaves for them"
         return Examination((), 0, time.perf_counter() - started, note)
@@ -175,7 +174,7 @@ def examine(
         decisions.append(decision)
     num_held_out = sum(len(fold.test) for fold in folds[: base.num_folds])
     wall_s = time.perf_counter() - started
-    return Examination(tuple(decisions), num_held_out, wall_s, smaller=smaller)
+    return Examination(tuple(decisions), num_held_out, wall_s)
 
 
 def _resemblance(fit: ShortFit) -> float:
@@ -198,28 +197,30 @@ def _try(
     """
     if not finding.is_likely or finding.is_measured:
         return replace(_reject(finding), chosen=finding.is_likely), base
+    tried = decision = None
     try:
-        short_fits.check_time(end - base.wall_s)
-        changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
-        tried = short_fits.fit_fold(changed, folds, base.factor, progress, end)
+        while decision is None or not decision.is_settled:
+            short_fits.check_time(end - base.wall_s)
+            if tried is None:
+                changes = {**finding.changes, **finding.in_short_fits}
+                changed = with_changes(base.config, changes)
+                tried = short_fits.fit_fold(changed, folds, 0, base.factor, progress, end)
+            elif tried.num_folds < len(folds):
+                if base.num_folds == tried.num_folds:
+                    base = short_fits.add_fold(base, folds, progress, end)
+                tried = short_fits.add_fold(tried, folds, progress, end)
+            else:
+                break
+            confirmed = finding if finding.confirm is None else finding.confirm(tried)
+            if confirmed is None:
+                return _reject(finding, "; a fit with it does not confirm it"), base
+            decision = decide(confirmed, base, tried, len(folds))
     except short_fits.OutOfTimeError:
-        return _reject(finding, "; no time was left to try it"), base
+        if decision is None:
+            return _reject(finding, "; no time was left to try it"), base
     except (ValidationError, UserError, NonFiniteError) as error:
         return _reject(finding, f"; could not be tried: {one_line(error, 100)}"), base
-    confirmed = finding if finding.confirm is None else finding.confirm(tried)
-    if confirmed is None:
-        return _reject(finding, "; a fit with it does not confirm it"), base
-    decision = decide(confirmed, base, tried, len(folds))
-    while not decision.is_settled and tried.num_folds < len(folds):
-        try:
-            short_fits.check_time(end - 2 * base.wall_s)
-            if base.num_folds == tried.num_folds:
-                base = short_fits.add_fold(base, folds, progress, end)
-            tried = short_fits.add_fold(tried, folds, progress, end)
-        except short_fits.OutOfTimeError:
-            text = f"{decision.evidence}; no time was left for more photographs"
-            return replace(decision, evidence=text), base
-        decision = decide(confirmed, base, tried, len(folds))
+    assert tried is not None and decision is not None, "a fit was tried"
     return decision, tried if decision.chosen else base
 
 
@@ -287,10 +288,7 @@ def _reject(finding: Finding, reason: str = "") -> Decision:
 
 
 def _reason_not_examined(config: FitConfig, dataset: Dataset) -> str:
-    count, least = (
-        len(dataset.train),
-        round(short_fits.MIN_ITERATIONS / short_fits.SHARE_OF_ITERATIONS),
-    )
+    count, least = len(dataset.train), short_fits.MIN_ITERATIONS_OF_FIT
     if count < MIN_VIEWS:
         return f"{count} training photographs are fewer than {MIN_VIEWS}"
     if config.iterations < least:
@@ -315,37 +313,23 @@ def _findings(fit: ShortFit) -> Iterator[Finding]:
         yield from [found] if isinstance(found, Finding) else found or ()
 
 
-def _border_colors(views: Sequence[View]) -> tuple[np.ndarray, float]:
-    """Return the colours (V, 3) of opaque photographs' borders, and which share of them is alike.
-
-    Photographs with transparency or masks have none.
-    """
+def _look_for_background(fit: ShortFit) -> Finding | None:
+    """Compare each pixel at the border of opaque photographs with the median of its border."""
+    views = (*fit.dataset.train, *fit.dataset.test)
     if any(view.alpha is not None or view.mask is not None for view in views):
-        return np.empty((0, 3)), 0.0
+        return None
     borders = [_border(np.asarray(view.image)) for view in views]
     colors = np.array([np.median(border, axis=0) for border in borders])
     deviations = [border - color for border, color in zip(borders, colors, strict=True)]
-    alike = (np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1)
-    return colors, float(alike.mean())
-
-
-def _look_for_background(fit: ShortFit) -> Finding | None:
-    """Compare each pixel at the border of opaque photographs with the median of its border."""
-    colors, share = _border_colors((*fit.dataset.train, *fit.dataset.test))
-    if not len(colors):
-        return None
+    share = float((np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1).mean())
     color = np.median(colors, axis=0)
     spread = np.median(np.abs(colors - color), axis=0)  # by exposure
     other = np.abs(color - fit.config.data.background_rgb) - 3 * spread
-    is_other = other.max() > BORDER_TOLERANCE
-    background = tuple(round(float(value), 3) for value in color)
-    shown = ", ".join(f"{value:.2f}" for value in background)
-    return Finding(
-        "background of one colour",
-        f"{share:.0%} of each border has one colour, mostly {shown}",
-        is_likely=share >= MIN_BORDER_SHARE and bool(is_other),
-        changes={"data.background": background},
-    )
+    is_likely = share >= MIN_BORDER_SHARE and bool(other.max() > BORDER_TOLERANCE)
+    shown = ", ".join(f"{value:.2f}" for value in color)
+    evidence = f"{share:.0%} of each border has one colour, mostly {shown}"
+    changes = {"data.background": tuple(round(float(value), 3) for value in color)}
+    return Finding("background of one colour", evidence, is_likely, changes)
 
 
 def _border(image: np.ndarray) -> np.ndarray:

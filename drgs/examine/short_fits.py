@@ -38,9 +38,9 @@ leaves undecided."""
 
 WARM_UP_ITERATIONS = 20  # of a short fit, whose time does not count: kernels are compiled
 
-TIMED_ITERATIONS, GROWTH, NUM_FITS = 10, 1.6, 2
-"""A plan for a given time: iterations that are timed; the time of later ones and of renderings,
-relative to these; and fits for which there must be time: with an effect and without."""
+TIMED_ITERATIONS, GROWTH = 10, 1.6
+"""Iterations by which the time of a short fit is predicted, and the time of later ones and of
+renderings, relative to these."""
 
 
 class OutOfTimeError(Exception):
@@ -51,32 +51,6 @@ def check_time(end: float) -> None:
     """Raise :class:`OutOfTimeError` after ``end``, by ``time.perf_counter``."""
     if time.perf_counter() > end:
         raise OutOfTimeError
-
-
-def plan_short_fits(config: FitConfig, fold: Dataset, end: float) -> tuple[FitConfig, str]:
-    """Return the configuration with iterations for which there is time, and what was made smaller.
-
-    config: of a short fit. Raises :class:`OutOfTimeError` if there is no time for the least.
-    """
-    if end == math.inf:
-        return config, ""
-    trainer, started = _make_trainer(config, fold), 0.0
-    for done in range(WARM_UP_ITERATIONS + TIMED_ITERATIONS):
-        check_time(end)
-        if done == WARM_UP_ITERATIONS:
-            dr.sync_thread()
-            started = time.perf_counter()
-        trainer.step()
-    trainer.check()
-    now = time.perf_counter()
-    trainer.release()
-    possible = int((end - now) / NUM_FITS / GROWTH / (now - started) * TIMED_ITERATIONS)
-    if possible < MIN_ITERATIONS:
-        raise OutOfTimeError
-    if possible >= config.iterations:
-        return config, ""
-    text = f"{possible} of {config.iterations} iterations"
-    return with_iterations(config, possible), text
 
 
 def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
@@ -100,59 +74,35 @@ def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
 def fit_fold(
     config: FitConfig,
     folds: Sequence[Dataset],
+    number: int,
     factor: int,
     progress: Callable[[int, int], None],
     end: float = math.inf,
     with_trained: bool = False,
 ) -> ShortFit:
-    """Fit the training views of the first fold, and render its test views; config: of a short fit.
+    """Fit the training views of a fold, and render its test views; config: of a short fit.
 
-    Photographs that the configuration leaves out are tested. with_trained: render the training
-    views as well.
-
-    Raises :class:`OutOfTimeError` after ``end``, by ``time.perf_counter``.
+    Photographs that the configuration leaves out are tested in the first fold. with_trained: render
+    the training views as well. Raises :class:`OutOfTimeError` after ``end``, by
+    ``time.perf_counter``.
     """
-    left_out = {*config.data.leave_out}
-    others = tuple(view for view in folds[0].train if view.name in left_out)
-    first = replace(folds[0], test=(*folds[0].test, *others))
-    return _short_fit(config, first, factor, progress, end, with_trained)
-
-
-def add_fold(
-    fit: ShortFit, folds: Sequence[Dataset], progress: Callable[[int, int], None], end: float
-) -> ShortFit:
-    """Return a fit with the test views of the next fold; the same errors."""
-    fold = folds[fit.num_folds]
-    more = _short_fit(fit.config, fold, fit.factor, progress, end, False)
-    return replace(
-        fit,
-        dataset=replace(fit.dataset, test=(*fit.dataset.test, *more.dataset.test)),
-        images=[*fit.images, *more.images],
-        alignments=[*fit.alignments, *more.alignments],
-        num_folds=fit.num_folds + 1,
-    )
-
-
-def _short_fit(
-    config: FitConfig,
-    split: Dataset,
-    factor: int,
-    progress: Callable[[int, int], None],
-    end: float,
-    with_trained: bool,
-) -> ShortFit:
-    left_out = {*config.data.leave_out}
-    train = tuple(view for view in split.train if view.name not in left_out)
-    split = with_background(replace(split, train=train), config)
+    left_out, fold = {*config.data.leave_out}, folds[number]
+    train = tuple(view for view in fold.train if view.name not in left_out)
+    others = () if number else tuple(view for view in fold.train if view.name in left_out)
+    split = with_background(replace(fold, train=train, test=(*fold.test, *others)), config)
     trainer = _make_trainer(config, split)
     started = time.perf_counter()
     while trainer.iteration < config.iterations:
         trainer.step()
         progress(trainer.iteration, config.iterations)
         check_time(end)
-        if trainer.iteration == WARM_UP_ITERATIONS:
+        if trainer.iteration in (WARM_UP_ITERATIONS, WARM_UP_ITERATIONS + TIMED_ITERATIONS):
             dr.sync_thread()
-            started = time.perf_counter()
+            now, left = time.perf_counter(), config.iterations - trainer.iteration
+            if trainer.iteration == WARM_UP_ITERATIONS:
+                started = now
+            else:
+                check_time(end - GROWTH * left * (now - started) / TIMED_ITERATIONS)
     trainer.check()  # waits for the device
     wall_s, count = time.perf_counter() - started, len(split.test)
     views = (*split.test, *split.train) if with_trained else split.test
@@ -163,6 +113,20 @@ def _short_fit(
     gaussians = trainer.gaussians()
     trainer.release()
     return ShortFit(trainer.config, split, gaussians, *tested, factor, wall_s, *trained)
+
+
+def add_fold(
+    fit: ShortFit, folds: Sequence[Dataset], progress: Callable[[int, int], None], end: float
+) -> ShortFit:
+    """Return a fit with the test views of the next fold; the same errors."""
+    more = fit_fold(fit.config, folds, fit.num_folds, fit.factor, progress, end)
+    return replace(
+        fit,
+        dataset=replace(fit.dataset, test=(*fit.dataset.test, *more.dataset.test)),
+        images=[*fit.images, *more.images],
+        alignments=[*fit.alignments, *more.alignments],
+        num_folds=fit.num_folds + 1,
+    )
 
 
 def _make_trainer(config: FitConfig, split: Dataset) -> Trainer:

@@ -76,8 +76,8 @@ def align(
         at, _ = _move(image, moved)
         smooth = ndimage.gaussian_filter(at, blur)
         base = ndimage.gaussian_filter(at - behind, blur)
-        directions = _directions(smooth, base)
-        numbers = _fit_numbers(directions, blurred - smooth, counts)
+        directions = [np.eye(3, dtype=np.float32)[:, None, None] * base, _directions(smooth)[:4]]
+        numbers = _fit_numbers(np.concatenate(directions), blurred - smooth, counts)
         gains, moved = numbers[:3].astype(np.float32), moved + numbers[3:]
         if np.abs(numbers[3:]).max() < MIN_MOVE_PX:
             break
@@ -85,8 +85,8 @@ def align(
     seen, left, others = counts * is_covered, photograph - at - gains * (at - behind), np.zeros(5)
     error = _mean_error(left, seen)
     if min(height, width) >= MIN_SIDE_PX:
-        smooth = ndimage.gaussian_filter(left, blur)
-        others = _fit_numbers(_other_directions(at, blur), smooth, seen)
+        directions = _directions(ndimage.gaussian_filter(at, blur))[2:]
+        others = _fit_numbers(directions, ndimage.gaussian_filter(left, blur), seen)
     farthest = max(np.abs(moved).max(), np.abs(others).max()) / (np.hypot(width, height) / 2)
     if is_covered.mean() < MIN_COVERED or farthest > MAX_MOVE or not error < before:
         moved, others = np.zeros(4), np.zeros(5)
@@ -100,8 +100,8 @@ def align(
         shift=moved[:2],
         psnr=-10 * float(np.log10(max(min(error, before), 1e-10))),
         zoom=float(moved[2] + others[0]),
-        distortion=float(others[1]),
-        skew=others[2:4],
+        distortion=float(others[2]),
+        skew=others[3:],
         sharpness=float(np.log(_mean_step(photograph, seen) / _mean_step(at, seen))),
         left=(np.sqrt(np.square(left).mean(axis=2)) * seen * is_opaque).astype(np.float32),
     )
@@ -149,26 +149,17 @@ def _move(image: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.stack(planes, axis=2), is_there
 
 
-def _directions(image: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Return the derivatives of an image (H, W, 3) along the numbers, (7, H, W, 3)."""
-    x, y = (each[..., None] for each in _coordinates(*image.shape[:2]))
-    dy, dx = np.gradient(image, axis=(0, 1))
-    directions = np.zeros((7, *image.shape), np.float32)
-    for channel in range(3):
-        directions[channel, ..., channel] = base[..., channel]
-    directions[3:] = dx, dy, x * dx + y * dy, x * dy - y * dx
-    return directions
+def _directions(image: np.ndarray) -> np.ndarray:
+    """Return the derivatives of an image (H, W, 3) along the numbers, (7, H, W, 3).
 
-
-def _other_directions(image: np.ndarray, blur: tuple[float, float, float]) -> np.ndarray:
-    """Return derivatives (5, H, W, 3).
-
-    They are along zoom, distortion, two skews, and a rotation, which has explained a part of them.
+    They are along the shift, zoom, rotation, distortion and skews, of which the rotation has
+    explained a part.
     """
     x, y = (each[..., None] for each in _coordinates(*image.shape[:2]))
-    dy, dx = np.gradient(ndimage.gaussian_filter(image, blur), axis=(0, 1))
+    dy, dx = np.gradient(image, axis=(0, 1))
     outward = x * dx + y * dy
-    return np.stack([outward, (x * x + y * y) * outward, y * dx, y * dy, x * dy - y * dx])
+    lens = (x * x + y * y) * outward, y * dx, y * dy
+    return np.stack([dx, dy, outward, x * dy - y * dx, *lens])
 
 
 def _fit_numbers(directions: np.ndarray, difference: np.ndarray, counts: np.ndarray) -> np.ndarray:

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 from support.commands import assert_ends_well, assert_refused
 from support.fit_command import assert_fit_refused, assert_fits, without_images
@@ -20,7 +19,6 @@ from drgs.config.extensions import EFFECTS
 from drgs.config.load import config_from
 from drgs.core.registry import temporary_registrations
 from drgs.effects.base import Finding, TrainingEffect
-from drgs.effects.colors import exposure_spread
 from drgs.examine import __main__ as command
 from drgs.examine.examination import Examination, decide, given_keys, middle_of, overlaps
 from drgs.examine.short_fits import split_views
@@ -267,26 +265,6 @@ def test_one_of_several_cameras_may_need_an_effect(others, chosen):
     gains = np.concatenate([np.full(8, 0.4), np.full(12, others)]) + rng.normal(0, 0.03, 20)
     assert decide(FINDING, *fits_with_gains(gains, [1] * 8 + [2] * 12)).chosen is chosen
     assert not decide(FINDING, *fits_with_gains(gains[8:])).chosen
-
-
-def write_photograph(path, time=None):
-    image, exif = Image.new("RGB", (4, 4)), Image.Exif()
-    if time is not None:
-        details = exif.get_ifd(ExifTags.IFD.Exif)
-        tags = ExifTags.Base
-        details |= {tags.ExposureTime: time, tags.FNumber: 2.0, tags.ISOSpeedRatings: 100}
-        exif.get_ifd(ExifTags.IFD.Exif).update(details)
-    image.save(path, exif=exif)
-    return path
-
-
-def test_exposures_of_exif_are_compared_if_all_photographs_have_one(tmp_path):
-    short, long = (write_photograph(tmp_path / f"{t}.jpg", t) for t in (0.01, 0.04))
-    assert exposure_spread([short, long]) == pytest.approx(1.0)  # 2 stops apart
-    assert exposure_spread([short, write_photograph(tmp_path / "none.jpg")]) is None
-    broken = tmp_path / "broken.jpg"
-    broken.write_bytes(b"no photograph")
-    assert exposure_spread([broken]) is None and exposure_spread([]) is None
 
 
 # Commands

@@ -24,7 +24,8 @@ def fit_with(sh_direction="mean", **middles):
     rng, views, alignments = np.random.default_rng(0), make_dataset(24).train, []
     for k in range(len(views)):
         values = {
-            name: middles.get(name, 0.0) + noise * rng.normal() for name, noise in NOISE.items()
+            name: middles.get(name, 0.0) + middles.get(f"{name}_noise", noise) * rng.normal()
+            for name, noise in NOISE.items()
         }
         skew = np.array([values["skew"] * rng.choice([-1, 1]), 0.05 * rng.normal()])
         left = np.full((24, 32), 0.01, np.float32)
@@ -55,6 +56,7 @@ def by_name(findings):
         ({"zoom": -0.5}, {"focal length"}),
         ({"distortion": 0.8}, {"distortion"}),
         ({"skew": 0.7}, {"rolling shutter"}),
+        ({"skew": 0.7, "zoom_noise": 0.6}, set()),
     ],
 )
 def test_lenses_and_shutters_differ_in_the_middle_of_all_photographs(middles, expected):
