@@ -79,14 +79,13 @@ class Photometry(CenteredEffect):
         found = [_finding("vignetting", "cannot be told from reflections", False)]
         if tones.falloff is not None:
             value, error = (each[np.argmin(tones.falloff[0])] for each in tones.falloff)
-            is_likely = -value > max(MIN_FALLOFF, MIN_ERRORS * error)
             text = f"corners are darker by {-np.expm1(value):.0%} ± {error:.0%}"
-            found = [_finding("vignetting", text, bool(is_likely))]
+            found = [_finding("vignetting", text, -value > max(MIN_FALLOFF, MIN_ERRORS * error))]
         if tones.response is not None:
             value, error = np.ptp(tones.response[0]), tones.response[1].max()
-            is_likely = value > max(MIN_RESPONSE, MIN_ERRORS * error)
             text = f"exponents of cameras differ by {value:.1%} ± {error:.1%}"
-            found.append(_finding("response", text, bool(is_likely)))
+            is_likely = value > max(MIN_RESPONSE, MIN_ERRORS * error)
+            found.append(_finding("response", text, is_likely))
         return found
 
     @classmethod
@@ -186,4 +185,4 @@ def camera_key(view: View) -> tuple[object, ...]:
 
 def _finding(name: str, evidence: str, is_likely: bool) -> Finding:
     changes = {f"colors.{name}_lr": EXAMINED_LRS[name]}
-    return Finding(name, evidence, is_likely, changes, is_measured=True)
+    return Finding(name, evidence, bool(is_likely), changes, is_measured=True)

@@ -83,8 +83,9 @@ class Examination:
     @property
     def bad_photographs(self) -> list[str]:
         """Names of photographs that should be left out, chosen or not."""
-        tried = (each.changes for each in self.decisions if each.gain is not None)
-        return [name for changes in tried for name in _left_out(changes)]
+        tried = [each.changes for each in self.decisions if each.gain is not None]
+        named = [cast("list[str]", changes.get("data.leave_out", [])) for changes in tried]
+        return [name for names in named for name in names]
 
     @property
     def changes(self) -> dict[str, object]:
@@ -157,9 +158,8 @@ def examine(
     if mi.variant() is None:
         select_variant(VARIANTS[0])
     try:
-        base = short_fits.fit_fold(
-            short, folds, 0, factor, partial(progress, "baseline"), end, True
-        )
+        steps = partial(progress, "baseline")
+        base = short_fits.fit_fold(short, folds, 0, factor, steps, end, True)
     except short_fits.OutOfTimeError:
         note = f"short fits take longer than the {seconds:.0f} s that --budget leaves for them"
         return Examination((), 0, time.perf_counter() - started, note)
@@ -202,8 +202,7 @@ def _try(
         while decision is None or not decision.is_settled:
             short_fits.check_time(end - base.wall_s)
             if tried is None:
-                changes = {**finding.changes, **finding.in_short_fits}
-                changed = with_changes(base.config, changes)
+                changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
                 tried = short_fits.fit_fold(changed, folds, 0, base.factor, progress, end)
             elif tried.num_folds < len(folds):
                 if base.num_folds == tried.num_folds:
@@ -224,10 +223,6 @@ def _try(
     return decision, tried if decision.chosen else base
 
 
-def _left_out(changes: Mapping[str, object]) -> list[str]:
-    return cast("list[str]", changes.get("data.leave_out", []))
-
-
 def decide(finding: Finding, without: ShortFit, fitted: ShortFit, num_looks: int = 1) -> Decision:
     """Return the decision about an effect from two short fits: the second one simulates it.
 
@@ -246,14 +241,12 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit, num_looks: int
     views = [view for view in fitted.dataset.test if view.name in kept]
     gains = np.array([after[view.name] - before[view.name] for view in views])
     keys = [camera_key(view) for view in views]
-    cameras = [np.array([key == other for other in keys]) for key in dict.fromkeys(keys)]
-    cameras = [of_camera for of_camera in cameras if of_camera.sum() >= MIN_CAMERA_VIEWS]
-    gain, spread = middle_of(gains)
-    chance = (1 - CONFIDENCE) / num_looks
-    alone = any(_counts(gains[each], chance / len(cameras)) for each in cameras)
-    agree = all(middle_of(gains[each])[0] > -MIN_GAIN_DB for each in cameras)
-    chosen = _counts(gains, chance) or (alone and agree)
-    cost = fitted.wall_s / without.wall_s
+    cameras = [gains[[key == other for other in keys]] for key in dict.fromkeys(keys)]
+    cameras = [each for each in cameras if len(each) >= MIN_CAMERA_VIEWS]
+    (gain, spread), chance = middle_of(gains), (1 - CONFIDENCE) / num_looks
+    alone = any(_counts(each, chance / len(cameras)) for each in cameras)
+    agree = all(middle_of(each)[0] > -MIN_GAIN_DB for each in cameras)
+    chosen, cost = _counts(gains, chance) or (alone and agree), fitted.wall_s / without.wall_s
     return replace(_reject(finding), gain=gain, spread=spread, cost=cost, chosen=chosen)
 
 
@@ -281,10 +274,8 @@ def _counts(gains: np.ndarray, max_chance: float) -> bool:
 
 
 def _reject(finding: Finding, reason: str = "") -> Decision:
-    effect, evidence = finding.effect, finding.evidence + reason
-    return Decision(
-        effect=effect, evidence=evidence, changes=finding.changes, advice=finding.advice
-    )
+    row = {name: getattr(finding, name) for name in ("effect", "changes", "advice")}
+    return Decision(evidence=finding.evidence + reason, **row)
 
 
 def _reason_not_examined(config: FitConfig, dataset: Dataset) -> str:

@@ -14,7 +14,7 @@ from drgs.fit.budget import Budget
 from drgs.fit.session import FitSession
 
 
-class Finished(Exception):
+class FinishedError(Exception):
     """All steps were taken."""
 
 
@@ -30,13 +30,13 @@ def fit_within(monkeypatch, seconds, seconds_of_step):
             clock[0] += seconds_of_step
 
         def check(self):
-            raise Finished
+            raise FinishedError
 
     monkeypatch.setattr(short_fits, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
     monkeypatch.setattr(short_fits, "_make_trainer", lambda config, split: Stub())
     config = shorten(config_from({"data": {"path": "."}, "iterations": 3000}, "test"))
     folds, factor = split_views(make_dataset(40))
-    with pytest.raises((OutOfTimeError, Finished)) as raised:
+    with pytest.raises((OutOfTimeError, FinishedError)) as raised:
         fit_fold(config, folds, 0, factor, lambda done, count: None, seconds)
     return len(steps), raised.type is OutOfTimeError
 
