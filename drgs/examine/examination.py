@@ -65,11 +65,6 @@ class Decision:
     advice: str = ""  # where they are not chosen, or there are none
     chosen: bool = False
 
-    @property
-    def is_settled(self) -> bool:
-        """Whether more photographs would not change it: it is chosen, or no gain that counts."""
-        return self.chosen or self.gain is None or self.gain <= MIN_GAIN_DB
-
 
 @dataclass(frozen=True)
 class Examination:
@@ -173,8 +168,7 @@ def examine(
         decision, base = _try(finding, base, folds, partial(progress, finding.effect), end)
         decisions.append(decision)
     num_held_out = sum(len(fold.test) for fold in folds[: base.num_folds])
-    wall_s = time.perf_counter() - started
-    return Examination(tuple(decisions), num_held_out, wall_s)
+    return Examination(tuple(decisions), num_held_out, time.perf_counter() - started)
 
 
 def _resemblance(fit: ShortFit) -> float:
@@ -199,7 +193,7 @@ def _try(
         return replace(_reject(finding), chosen=finding.is_likely), base
     tried = decision = None
     try:
-        while decision is None or not decision.is_settled:
+        while decision is None or (not decision.chosen and (decision.gain or 0) > MIN_GAIN_DB):
             short_fits.check_time(end - base.wall_s)
             if tried is None:
                 changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
@@ -233,10 +227,8 @@ def decide(finding: Finding, without: ShortFit, fitted: ShortFit, num_looks: int
     and Lehmann 1963), which a few that differ do not move, nor do they spread it. It counts where
     it does over all photographs, or over those of one camera while others do not lose.
     """
-    before, after = (
-        {view.name: psnr for view, psnr in zip(fit.dataset.test, fit.psnr, strict=True)}
-        for fit in (without, fitted)
-    )
+    pairs = (zip(fit.dataset.test, fit.psnr, strict=True) for fit in (without, fitted))
+    before, after = ({view.name: psnr for view, psnr in each} for each in pairs)
     kept = before.keys() - {*fitted.config.data.leave_out}
     views = [view for view in fitted.dataset.test if view.name in kept]
     gains = np.array([after[view.name] - before[view.name] for view in views])

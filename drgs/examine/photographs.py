@@ -133,17 +133,16 @@ def _regions(alignments: Sequence[Alignment], is_of_border: bool = False) -> np.
     is_of_border: of regions that reach the border, in a width of the root of their area.
     """
     medians = [np.median(one.left[one.left > 0]) for one in alignments if one.left.any()]
-    least = COVERED_DEVIATIONS * np.median(medians or [1.0])
-    differs = [ndimage.uniform_filter(one.left, 3) > least for one in alignments]
-    labels = [cast("tuple[np.ndarray, int]", ndimage.label(each))[0] for each in differs]
-    if is_of_border:
-        borders = [np.concatenate([*each[[1, -2]], *each[:, [1, -2]].T]) for each in labels]
-        reach = [
-            np.bincount(b, minlength=x.max() + 1) for b, x in zip(borders, labels, strict=True)
-        ]
-        wide = [n > np.sqrt(np.bincount(x.ravel())) for n, x in zip(reach, labels, strict=True)]
-        labels = [x * w[x] for x, w in zip(labels, wide, strict=True)]
-    return np.array([max(np.bincount(each.ravel())[1:], default=0) / each.size for each in labels])
+    least, shares = COVERED_DEVIATIONS * np.median(medians or [1.0]), []
+    for one in alignments:
+        differs = ndimage.uniform_filter(one.left, 3) > least
+        labels, count = cast("tuple[np.ndarray, int]", ndimage.label(differs))
+        areas = np.bincount(labels.ravel())[1:]
+        if is_of_border:
+            border = np.concatenate([labels[[1, -2]].ravel(), labels[:, [1, -2]].ravel()])
+            areas = areas[np.bincount(border, minlength=count + 1)[1:] > np.sqrt(areas)]
+        shares.append(max(areas, default=0) / labels.size)
+    return np.array(shares)
 
 
 def _thumbnail(image: np.ndarray) -> np.ndarray:
