@@ -1,9 +1,9 @@
 """Effects that a dataset needs, chosen by measurement: :func:`examine`.
 
 A short fit leaves some training photographs out. What they differ by from its renderings shows
-which effects are likely (:class:`drgs.effects.base.Finding`); each of these is simulated in a
-short fit of its own, and chosen if the photographs that were left out are matched better. Test
-photographs are not looked at.
+which effects are likely (:class:`drgs.effects.base.Finding`); each of these is simulated in a short
+fit of its own, and chosen if the photographs that were left out are matched better. What can be
+measured without is chosen at once. Test photographs are not looked at.
 """
 
 from __future__ import annotations
