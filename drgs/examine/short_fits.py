@@ -31,10 +31,9 @@ than six times the least is not examined."""
 MIN_ITERATIONS_OF_FIT = round(MIN_ITERATIONS / SHARE_OF_ITERATIONS)
 
 MAX_VIEWS = 160  # photographs of an examination
-NUM_HELD_OUT, HELD_OUT_STRIDE = 10, (4, 8)
-"""Photographs that are left out, about: one in four to one in eight. Below 40 photographs, so many
-folds leave out others that there are 10. Folds after the first are fitted for an effect that it
-leaves undecided."""
+NUM_HELD_OUT, HELD_OUT_STRIDE, MAX_HELD_OUT = 10, (4, 8), 20
+"""Photographs that are left out, about: one in four to one in eight, and by so many folds that they
+are 20. Those after the first are fitted for an effect that it leaves undecided."""
 
 WARM_UP_ITERATIONS = 20  # of a short fit, whose time does not count: kernels are compiled
 
@@ -54,15 +53,12 @@ def check_time(end: float) -> None:
 
 
 def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
-    """Return folds of the training photographs, small, and their divisor.
-
-    ``test`` of each fold are photographs that it leaves out; one fold, unless photographs are few.
-    """
+    """Return folds of training photographs, small, that leave their ``test`` out; the divisor."""
     views = evenly_spaced(dataset.train, MAX_VIEWS)
     factor = max(1, round(max(view.width for view in views) / SHORT_FIT_WIDTH_PX))
     stride = int(np.clip(len(views) // NUM_HELD_OUT, *HELD_OUT_STRIDE))
     small = [with_arrays(smaller_view(view, factor)) for view in views]
-    num_folds = min(stride, -(-NUM_HELD_OUT * stride // len(views)))
+    num_folds = min(stride, -(-MAX_HELD_OUT * stride // len(views)))
     folds = []
     for first in np.roll(np.arange(stride), -(stride // 2))[:num_folds]:
         train = tuple(view for index, view in enumerate(small) if index % stride != first)
