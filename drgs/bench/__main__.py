@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from drgs.cli.commands import CommandParser, Subcommand, run_command
 
 COMMANDS = {
-    "speed": "times of drgs and of other renderers on the same scene, in one run",
+    "speed": "times of drgs and of other renderers on the same scene, in one run"
 }  # descriptions by module
 
 

@@ -12,11 +12,7 @@ from drgs.integrator.scene import film_description
 from drgs.reference import splatting as reference
 
 BENCH_TO_WORLD = np.array(
-    [
-        [-1.0, 0.0, 0.0, 0.0],
-        [0.0, -0.73411, 0.679031, 2.73726],
-        [0.0, 0.679031, 0.73411, 2.959292],
-    ]
+    [[-1.0, 0.0, 0.0, 0.0], [0.0, -0.73411, 0.679031, 2.73726], [0.0, 0.679031, 0.73411, 2.959292]]
 )
 """Camera to world in OpenGL axes: the first test camera of the NeRF-synthetic Lego."""
 

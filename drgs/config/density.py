@@ -30,9 +30,7 @@ class PruneConfig(Section):
         description="Iteration after which it begins, at least densify.stop. null: densify.stop.",
     )
     stop: Count | None = Field(
-        None,
-        ge=2,
-        description="Iteration of the last change. null: half of the remaining ones.",
+        None, ge=2, description="Iteration of the last change. null: half of the remaining ones."
     )
     every: Count = Field(50, ge=1, description="Iterations between two changes.")
 

@@ -119,10 +119,7 @@ class DataConfig(Section):
         "and of the splats in training, evaluation and rendering. null: white if any image is "
         "transparent, else black.",
     )
-    random_background: bool = Field(
-        False,
-        description="Use a random background in each iteration.",
-    )
+    random_background: bool = Field(False, description="Use a random background in each iteration.")
     ignore_distortion: bool = Field(False, description="Ignore lens distortion.")
     ignore_motion: bool = Field(False, description="Ignore motion of the camera during exposure.")
     shutter_samples: int = Field(
@@ -198,9 +195,7 @@ class InitConfig(Section):
         "points of unknown error (-1); null: keep all.",
     )
     min_track_length: Count | None = Field(
-        None,
-        ge=0,
-        description="Drop COLMAP's points that fewer images observe; null: keep all.",
+        None, ge=0, description="Drop COLMAP's points that fewer images observe; null: keep all."
     )
 
 
@@ -366,14 +361,10 @@ class OutputConfig(Section):
         description="Output folder, relative to the configuration file; null: out/NAME in the "
         "current folder, with the NAME of the configuration file.",
     )
-    bake_smoothing: bool = Field(
-        False,
-        description="Bake model.smoothing into point_cloud.ply.",
-    )
+    bake_smoothing: bool = Field(False, description="Bake model.smoothing into point_cloud.ply.")
     save_renders: bool = Field(True, description="Write renders/<split>/*.png.")
     report: bool = Field(
-        True,
-        description="Write report.html, viewer.html, side_by_side/, curves.png and the orbit.",
+        True, description="Write report.html, viewer.html, side_by_side/, curves.png and the orbit."
     )
     history_every: Count = Field(10, ge=1, description="Iterations between rows of history.csv.")
     checkpoint_every: Count | None = Field(

@@ -6,6 +6,7 @@ its part in a fit; its files; and its stage in an image, where it has one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -75,19 +76,15 @@ class ShortFit:
     images: Sequence[np.ndarray]  # (H, W, 3) display space: renderings of the held-out views
     alignments: Sequence[Alignment]  # of these
     factor: int  # px of the dataset's photographs in one of the fit's
-    wall_s: float  # of its iterations
+    wall_s: float  # of its iterations, in the first fold
     trained: Sequence[Alignment] = ()  # of the first fold's training views; without effects alone
     trained_images: Sequence[np.ndarray] = ()  # (H, W, 3) display space, of these
+    num_folds: int = 1
 
     @property
     def psnr(self) -> np.ndarray:
         """The held-out views' PSNR, (V,) dB, with the differences of a camera removed."""
         return np.array([alignment.psnr for alignment in self.alignments])
-
-    @property
-    def toned_psnr(self) -> np.ndarray:
-        """The same, also without vignetting and response."""
-        return np.array([alignment.toned_psnr for alignment in self.alignments])
 
 
 @dataclass(frozen=True)
@@ -102,7 +99,13 @@ class Finding:
     advice: str = ""  # what to do where it is not chosen; in place of changes, if no fit has any
     confirm: Callable[[ShortFit], Finding | None] | None = None
     """Returns the finding with the evidence of the fit that has the effect; None: it has none."""
-    max_loss: float | None = None  # dB, of what is confirmed; None: it is chosen by its gain
+    is_measured: bool = False  # whether the evidence is enough to choose it, without such a fit
+
+
+def trimmed_deviation(values: np.ndarray) -> float:
+    """Return the root mean square of values, without the tenth of them that is largest."""
+    squares = np.sort(np.square(values))
+    return float(np.sqrt(squares[: len(squares) - math.ceil(len(squares) / 10)].mean()))
 
 
 Progress = Callable[[str, int, int], None]  # what is tried, iterations done, and of how many

@@ -26,7 +26,14 @@ from drgs.core.errors import UserError
 from drgs.core.files import write_json
 from drgs.core.types import Array3f, Float
 from drgs.datasets.camera_file import cameras_json
-from drgs.effects.base import Finding, ShortFit, SimulatedEffect, entries, join_parts
+from drgs.effects.base import (
+    Finding,
+    ShortFit,
+    SimulatedEffect,
+    entries,
+    join_parts,
+    trimmed_deviation,
+)
 from drgs.effects.optimised import OptimisedEffect
 
 if TYPE_CHECKING:
@@ -38,7 +45,7 @@ CAMERAS = "cameras.json"  # refined cameras of the training views
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
-MIN_SHIFT_PX = 0.35  # RMS, of photographs in a short fit; without wrong poses: 0.04 to 0.25
+MIN_SHIFT_PX = 0.35  # RMS, of photographs in a short fit; without wrong poses: 0.04 to 0.4
 MIN_ZOOM_PX, MIN_BEND_PX, MIN_SKEW_PX = 0.25, 0.5, 0.5
 """The same, at corners: middles of all photographs, without: 0.1, 0.35, 0.05 to 0.4."""
 MIN_DEVIATIONS = 1.3  # of such a middle from 0; without texture: 1.2
@@ -151,8 +158,8 @@ class CameraRefinement(OptimisedEffect):
         views = (*fit.alignments, *fit.trained)
         zoom, bend = (_middle([getattr(v, name) for v in views]) for name in ("zoom", "distortion"))
         skew, other = np.median([np.abs(v.skew) for v in views], axis=0)
-        shifts = np.stack([alignment.shift for alignment in fit.alignments])
-        shift = float(np.sqrt(np.square(shifts).sum(axis=1).mean()))
+        noise = max(other, _deviation([v.zoom for v in views]))  # photographs have one zoom
+        shift = trimmed_deviation(np.array([np.hypot(*each.shift) for each in fit.alignments]))
         rates = {"cameras.rotation_lr": SHORT_FIT_RATE, "cameras.translation_lr": SHORT_FIT_RATE}
         poses, focal = {"cameras.optimise": True}, {"cameras.focal_lr": SHORT_FIT_RATE}
         moved = f"photographs are shifted by {shift * fit.factor:.1f} px"
@@ -160,7 +167,7 @@ class CameraRefinement(OptimisedEffect):
         bent = f"corners are bent by {bend * fit.factor:.1f} px"
         sheared = f"rows are sheared by {skew * fit.factor:.1f} px"
         calibrate = "calibrate the lens" if abs(bend) > MIN_BEND_PX else ""
-        is_rolling = skew > max(MIN_SKEW_PX, 1.5 * other)
+        is_rolling = skew > max(MIN_SKEW_PX, 1.5 * noise)
         both = "two poses and shutter: rolling, if it is a video" if is_rolling else ""
         found = [
             Finding("camera refinement", moved, shift > MIN_SHIFT_PX, poses, rates),
@@ -306,8 +313,12 @@ class CameraRefinement(OptimisedEffect):
 def _middle(values: Sequence[float]) -> float:
     """Return the median; 0 unless it is far from 0 for the normal deviation of a single value."""
     middle = float(np.median(values))
-    deviation = 1.4826 * np.median(np.abs(np.array(values) - middle))
-    return middle if abs(middle) > MIN_DEVIATIONS * deviation else 0.0
+    return middle if abs(middle) > MIN_DEVIATIONS * _deviation(values) else 0.0
+
+
+def _deviation(values: Sequence[float]) -> float:
+    """Return the normal deviation of single values, by the median absolute one."""
+    return 1.4826 * float(np.median(np.abs(np.array(values) - np.median(values))))
 
 
 def _set_sensor(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:

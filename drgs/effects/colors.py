@@ -8,14 +8,12 @@ compensation" has neither constraint.) The background behind a transparent photo
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import drjit as dr
 import numpy as np
-from PIL import ExifTags, Image
 from pydantic import Field
 from typing_extensions import override
 
@@ -24,7 +22,14 @@ from drgs.config.section import Rate, Section, Weight
 from drgs.core.arrays import image_of, planes_of, types_of
 from drgs.core.files import write_json
 from drgs.core.types import Float, TensorXf
-from drgs.effects.base import Finding, ShortFit, SimulatedEffect, as_numbers, opacity_of
+from drgs.effects.base import (
+    Finding,
+    ShortFit,
+    SimulatedEffect,
+    as_numbers,
+    opacity_of,
+    trimmed_deviation,
+)
 from drgs.effects.optimised import CenteredEffect
 
 if TYPE_CHECKING:
@@ -37,8 +42,6 @@ EXAMINED_LR = 0.02  # of the transforms where an examination chooses them
 MIN_BRIGHTNESS_DEVIATION, MIN_COLOR_DEVIATION = 0.025, 0.012
 """Standard deviations of photographs' gains, and of colours' gains in a photograph, from which a
 short fit is worth its time: about twice those of renderings and photographs without differences."""
-
-MIN_STOPS = 0.1  # the same, of the exposures that EXIF gives
 
 COLORS = "colors.json"  # transforms of the training views
 
@@ -104,17 +107,13 @@ class ColorCorrection(CenteredEffect):
         """Compare the gains of held-out photographs over their renderings."""
         gains = np.stack([alignment.gains for alignment in fit.alignments])
         exposures = gains.mean(axis=1)
-        by_view, by_color = float(exposures.std()), float((gains - exposures[:, None]).std())
+        by_view = trimmed_deviation(exposures - np.median(exposures))
+        by_color = float((gains - exposures[:, None]).std())
         evidence = f"brightness differs by {by_view:.1%}, colours by {by_color:.1%}"
-        views = (*fit.dataset.train, *fit.dataset.test)
-        stops = exposure_spread([v.files["image"] for v in views if "image" in v.files])
-        if stops is not None:
-            evidence += f", EXIF's exposures by {stops:.1f} stops"
-        is_seen = by_view > MIN_BRIGHTNESS_DEVIATION or by_color > MIN_COLOR_DEVIATION
         return Finding(
             "exposure and white balance",
             evidence,
-            is_likely=is_seen or (stops or 0.0) > MIN_STOPS,
+            is_likely=by_view > MIN_BRIGHTNESS_DEVIATION or by_color > MIN_COLOR_DEVIATION,
             changes={"colors.lr": EXAMINED_LR},
         )
 
@@ -165,29 +164,6 @@ class ColorCorrection(CenteredEffect):
         """Write ``colors.json``: the transform of each training view, 3 x 4, by name."""
         pairs = zip(dataset.train, self.transforms(), strict=True)
         write_json(folder / COLORS, {view.name: matrix.tolist() for view, matrix in pairs})
-
-
-def exposure_spread(paths: Sequence[Path]) -> float | None:
-    """Return the standard deviation of the exposures that EXIF gives, in stops.
-
-    An exposure is time x sensitivity / aperture^2; None if a photograph does not give all three.
-    """
-    exposures = [_exposure_of(path) for path in paths]
-    known = [exposure for exposure in exposures if exposure is not None]
-    return float(np.std(np.log2(known))) if known and len(known) == len(exposures) else None
-
-
-def _exposure_of(path: Path) -> float | None:
-    tags = ExifTags.Base
-    try:
-        with warnings.catch_warnings(), Image.open(path) as image:
-            warnings.simplefilter("ignore")
-            details = image.getexif().get_ifd(ExifTags.IFD.Exif)
-        time, aperture = float(details[tags.ExposureTime]), float(details[tags.FNumber])
-        product = time * float(details[tags.ISOSpeedRatings]) / aperture**2
-    except Exception:  # Pillow raises many types for broken EXIF, which is ignored
-        return None
-    return product if 0 < product < float("inf") else None
 
 
 def transform_colors(image: TensorXf, matrix: TensorXf) -> TensorXf:

@@ -13,8 +13,8 @@ camera has none. The background behind a transparent photograph is unchanged.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +30,7 @@ from drgs.core.types import Float, TensorXf
 from drgs.effects.base import Finding, ShortFit, SimulatedEffect, as_tensor, entries, opacity_of
 from drgs.effects.colors import ColorConfig
 from drgs.effects.optimised import CenteredEffect
+from drgs.effects.tones import find_tones
 
 if TYPE_CHECKING:
     from drgs.config.schema import FitConfig
@@ -43,17 +44,10 @@ PHOTOMETRY = "photometry.json"  # vignetting and response of the training views'
 COEFFICIENTS = {"vignetting": 3, "response": 2}
 
 EXAMINED_LRS = {"vignetting": 0.03, "response": 0.005}  # where an examination chooses them
-SHORT_FIT_LR, MAX_LOSS_DB = 0.003, 0.5  # in short fits, in which they have no time to settle
+MIN_FALLOFF, MIN_RESPONSE, MIN_ERRORS = 0.12, 0.04, 4.0
+"""Brightness of corners, differences between exponents of cameras; and both in standard errors."""
 
-EVIDENCE = {
-    "vignetting": ("corners are darker by {:.1%}", (0.004, 0.06)),
-    "response": ("exponents of cameras differ by {:.1%}", (0.02, 0.04)),
-}
-"""Differences of photographs from renderings, which absorb most of them, from which a short fit is
-worth its time; and those of its renderings, which have absorbed less, from which it confirms them.
-"""
-
-MIN_CAMERA_VIEWS = 5  # that show them
+MIN_CAMERA_VIEWS = 5  # by which a camera's are found
 
 
 @EFFECTS.register("photometry")
@@ -73,11 +67,26 @@ class Photometry(CenteredEffect):
     @classmethod
     @override
     def look_for(cls, fit: ShortFit) -> list[Finding]:
-        """Measure how photographs' corners and tones differ, by the middle of each camera's.
+        """Compare the brightness of points between photographs, and cameras.
 
-        Splats absorb most of it. What they have absorbed shows when a fit has coefficients.
+        Splats absorb both, so that a fit with them does not show whether they are needed.
         """
-        return [found for name in COEFFICIENTS if (found := _finding(name, 0, fit))]
+        views = (*fit.dataset.test, *fit.dataset.train)
+        counts = Counter(camera_key(view) for view in views)
+        rows = {key: k for k, (key, n) in enumerate(counts.most_common()) if n >= MIN_CAMERA_VIEWS}
+        views = [view for view in views if camera_key(view) in rows]
+        tones = find_tones(views, [rows[camera_key(view)] for view in views], fit.gaussians)
+        found = [_finding("vignetting", "cannot be told from reflections", False)]
+        if tones.falloff is not None:
+            value, error = (each[np.argmin(tones.falloff[0])] for each in tones.falloff)
+            text = f"corners are darker by {-np.expm1(value):.0%} ± {error:.0%}"
+            found = [_finding("vignetting", text, -value > max(MIN_FALLOFF, MIN_ERRORS * error))]
+        if tones.response is not None:
+            value, error = np.ptp(tones.response[0]), tones.response[1].max()
+            text = f"exponents of cameras differ by {value:.1%} ± {error:.1%}"
+            is_likely = value > max(MIN_RESPONSE, MIN_ERRORS * error)
+            found.append(_finding("response", text, is_likely))
+        return found
 
     @classmethod
     @override
@@ -174,21 +183,6 @@ def camera_key(view: View) -> tuple[object, ...]:
     return *size, view.fx, view.fy, view.cx, view.cy, repr(view.lens)
 
 
-def _finding(name: str, stage: int, fit: ShortFit) -> Finding | None:
-    """Return what the middle of each camera's views shows; None: nothing, or too little at stage 1.
-
-    stage: 0 without the effect, 1 with it.
-    """
-    views, alignments = (*fit.dataset.test, *fit.dataset.train), (*fit.alignments, *fit.trained)
-    cameras: dict[tuple[object, ...], list[float]] = {}
-    for view, alignment in zip(views, alignments, strict=False):
-        cameras.setdefault(camera_key(view), []).append(getattr(alignment, name))
-    middles = [np.median(each) for each in cameras.values() if len(each) >= MIN_CAMERA_VIEWS]
-    if len(middles) < (1 if name == "vignetting" else 2):
-        return None
-    value = float(-np.min(middles) if name == "vignetting" else np.ptp(middles))
-    text, least = EVIDENCE[name]
-    changes, rates = ({f"colors.{name}_lr": lr} for lr in (EXAMINED_LRS[name], SHORT_FIT_LR))
-    likely, confirm = value > least[stage], partial(_finding, name, 1)
-    found = Finding(name, text.format(value), likely, changes, rates, "", confirm, MAX_LOSS_DB)
-    return None if stage and not likely else found
+def _finding(name: str, evidence: str, is_likely: bool) -> Finding:
+    changes = {f"colors.{name}_lr": EXAMINED_LRS[name]}
+    return Finding(name, evidence, bool(is_likely), changes, is_measured=True)

@@ -61,14 +61,10 @@ def run(args: argparse.Namespace) -> None:
         words = ["drgs", "fit", str(args.config)]
         words += [word for name in bad for word in ("--leave-out", name)]
         kept = (each for each in changes.items() if each[0] != "data.leave_out")
-        chosen = (f"{key}={_yaml_of(value)}" for key, value in kept)
-        for each in (*args.overrides, *chosen):
+        kept = ((k, list(v) if isinstance(v, tuple) else v) for k, v in kept)
+        for each in (*args.overrides, *(f"{key}={format_value(value)}" for key, value in kept)):
             words += ["--set", each]
         print(f"fit with it: {shlex.join(words)}")
-
-
-def _yaml_of(value: object) -> str:
-    return format_value(list(value) if isinstance(value, tuple) else value)
 
 
 if __name__ == "__main__":

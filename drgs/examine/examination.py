@@ -1,9 +1,9 @@
 """Effects that a dataset needs, chosen by measurement: :func:`examine`.
 
 A short fit leaves some training photographs out. What they differ by from its renderings shows
-which effects are likely (:class:`drgs.effects.base.Finding`); each of these is simulated in a
-short fit of its own, and chosen if the photographs that were left out are matched better. Test
-photographs are not looked at.
+which effects are likely (:class:`drgs.effects.base.Finding`); each of these is simulated in a short
+fit of its own, and chosen if the photographs that were left out are matched better. What can be
+measured without is chosen at once. Test photographs are not looked at.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from drgs.config.load import config_from
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
 from drgs.core.errors import UserError, one_line
-from drgs.datasets.types import Dataset, View
+from drgs.datasets.types import Dataset
 from drgs.effects.base import Finding, Progress, ShortFit
 from drgs.effects.photometry import camera_key
 from drgs.examine import short_fits
@@ -74,13 +74,13 @@ class Examination:
     num_held_out: int  # training photographs
     wall_s: float
     note: str = ""  # why nothing was examined, if so
-    smaller: str = ""  # what there was no time for
 
     @property
     def bad_photographs(self) -> list[str]:
         """Names of photographs that should be left out, chosen or not."""
-        tried = (each.changes for each in self.decisions if each.gain is not None)
-        return [name for changes in tried for name in _left_out(changes)]
+        tried = [each.changes for each in self.decisions if each.gain is not None]
+        named = [cast("list[str]", changes.get("data.leave_out", [])) for changes in tried]
+        return [name for names in named for name in names]
 
     @property
     def changes(self) -> dict[str, object]:
@@ -92,7 +92,7 @@ class Examination:
     def reasons(self) -> dict[str, str]:
         """The evidence for each of these, by key."""
         return {
-            key: f"{decision.evidence}: {decision.gain:+.2f} dB"
+            key: decision.evidence + ("" if decision.gain is None else f": {decision.gain:+.2f} dB")
             for decision in self.decisions
             for key in decision.changes
             if decision.chosen
@@ -120,8 +120,7 @@ class Examination:
             for row in rows
         )
         title = f"examined in {self.wall_s:.0f} s, on {self.num_held_out} held-out views"
-        title += f" (within --budget: {self.smaller}):" if self.smaller else ":"
-        return "\n  ".join([title, *lines])
+        return "\n  ".join([f"{title}:", *lines])
 
 
 @EXAMINERS.register("short_fits")
@@ -154,8 +153,8 @@ def examine(
     if mi.variant() is None:
         select_variant(VARIANTS[0])
     try:
-        short, folds, smaller = short_fits.plan_short_fits(short, folds, end)
-        base = short_fits.fit_folds(short, folds, factor, partial(progress, "baseline"), end, True)
+        steps = partial(progress, "baseline")
+        base = short_fits.fit_fold(short, folds, 0, factor, steps, end, True)
     except short_fits.OutOfTimeError:
         note = f"short fits take longer than the {seconds:.0f} s that --budget leaves for them"
         return Examination((), 0, time.perf_counter() - started, note)
@@ -168,15 +167,14 @@ def examine(
             continue
         decision, base = _try(finding, base, folds, partial(progress, finding.effect), end)
         decisions.append(decision)
-    num_held_out = sum(len(fold.test) for fold in folds)
-    wall_s = time.perf_counter() - started
-    return Examination(tuple(decisions), num_held_out, wall_s, smaller=smaller)
+    num_held_out = sum(len(fold.test) for fold in folds[: base.num_folds])
+    return Examination(tuple(decisions), num_held_out, time.perf_counter() - started)
 
 
 def _resemblance(fit: ShortFit) -> float:
     """Return the middle share of training photographs' variance that aligned renderings explain."""
     pairs = zip(fit.dataset.train, fit.trained, strict=True)
-    left = [10 ** (-one.toned_psnr / 10) / np.var(np.asarray(view.image)) for view, one in pairs]
+    left = [10 ** (-one.psnr / 10) / np.var(np.asarray(view.image)) for view, one in pairs]
     return float(1 - np.median(left))
 
 
@@ -187,56 +185,60 @@ def _try(
     progress: Callable[[int, int], None],
     end: float,
 ) -> tuple[Decision, ShortFit]:
-    """Return the decision about a finding, and the fit beside which the next one is tried."""
-    if not finding.is_likely:
-        return _reject(finding), base
+    """Return the decision about a finding, and the fit beside which the next one is tried.
+
+    A fold after the first is fitted while the effect gains, but not enough.
+    """
+    if not finding.is_likely or finding.is_measured:
+        return replace(_reject(finding), chosen=finding.is_likely), base
+    tried = decision = None
     try:
-        short_fits.check_time(end - base.wall_s)
-        changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
-        tried = short_fits.fit_folds(changed, folds, base.factor, progress, end)
+        while decision is None or (not decision.chosen and (decision.gain or 0) > MIN_GAIN_DB):
+            short_fits.check_time(end - base.wall_s)
+            if tried is None:
+                changed = with_changes(base.config, {**finding.changes, **finding.in_short_fits})
+                tried = short_fits.fit_fold(changed, folds, 0, base.factor, progress, end)
+            elif tried.num_folds < len(folds):
+                if base.num_folds == tried.num_folds:
+                    base = short_fits.add_fold(base, folds, progress, end)
+                tried = short_fits.add_fold(tried, folds, progress, end)
+            else:
+                break
+            confirmed = finding if finding.confirm is None else finding.confirm(tried)
+            if confirmed is None:
+                return _reject(finding, "; a fit with it does not confirm it"), base
+            decision = decide(confirmed, base, tried, len(folds))
     except short_fits.OutOfTimeError:
-        return _reject(finding, "; no time was left to try it"), base
+        if decision is None:
+            return _reject(finding, "; no time was left to try it"), base
     except (ValidationError, UserError, NonFiniteError) as error:
         return _reject(finding, f"; could not be tried: {one_line(error, 100)}"), base
-    confirmed = finding if finding.confirm is None else finding.confirm(tried)
-    if confirmed is None:
-        return _reject(finding, "; a fit with it does not confirm it"), base
-    decision = decide(confirmed, base, tried)
+    assert tried is not None and decision is not None, "a fit was tried"
     return decision, tried if decision.chosen else base
 
 
-def _left_out(changes: Mapping[str, object]) -> list[str]:
-    return cast("list[str]", changes.get("data.leave_out", []))
-
-
-def decide(finding: Finding, without: ShortFit, fitted: ShortFit) -> Decision:
+def decide(finding: Finding, without: ShortFit, fitted: ShortFit, num_looks: int = 1) -> Decision:
     """Return the decision about an effect from two short fits: the second one simulates it.
+
+    num_looks: so often it may be decided, after one fold and after more. Each decision has its
+    share of the chance of a false alarm (Bonferroni).
 
     The gain is the median of the mean gains of all pairs of held-out photographs, by ranks (Hodges
     and Lehmann 1963), which a few that differ do not move, nor do they spread it. It counts where
     it does over all photographs, or over those of one camera while others do not lose.
     """
-    pairs = (without.psnr, fitted.psnr)
-    if finding.max_loss is not None:  # renderings of held-out views have no vignetting
-        pairs = (without.toned_psnr, fitted.toned_psnr)
-    before, after = (
-        {view.name: psnr for view, psnr in zip(fit.dataset.test, values, strict=True)}
-        for fit, values in zip((without, fitted), pairs, strict=True)
-    )
+    pairs = (zip(fit.dataset.test, fit.psnr, strict=True) for fit in (without, fitted))
+    before, after = ({view.name: psnr for view, psnr in each} for each in pairs)
     kept = before.keys() - {*fitted.config.data.leave_out}
     views = [view for view in fitted.dataset.test if view.name in kept]
     gains = np.array([after[view.name] - before[view.name] for view in views])
     keys = [camera_key(view) for view in views]
-    cameras = [np.array([key == other for other in keys]) for key in dict.fromkeys(keys)]
-    cameras = [of_camera for of_camera in cameras if of_camera.sum() >= MIN_CAMERA_VIEWS]
-    gain, spread = middle_of(gains)
-    if finding.max_loss is not None:
-        chosen = gain > -finding.max_loss
-    else:
-        alone = any(_counts(gains[each], 1 - (1 - CONFIDENCE) / len(cameras)) for each in cameras)
-        agree = all(middle_of(gains[each])[0] > -MIN_GAIN_DB for each in cameras)
-        chosen = _counts(gains, CONFIDENCE) or (alone and agree)
-    cost = fitted.wall_s / without.wall_s
+    cameras = [gains[[key == other for other in keys]] for key in dict.fromkeys(keys)]
+    cameras = [each for each in cameras if len(each) >= MIN_CAMERA_VIEWS]
+    (gain, spread), chance = middle_of(gains), (1 - CONFIDENCE) / num_looks
+    alone = any(_counts(each, chance / len(cameras)) for each in cameras)
+    agree = all(middle_of(each)[0] > -MIN_GAIN_DB for each in cameras)
+    chosen, cost = _counts(gains, chance) or (alone and agree), fitted.wall_s / without.wall_s
     return replace(_reject(finding), gain=gain, spread=spread, cost=cost, chosen=chosen)
 
 
@@ -253,28 +255,23 @@ def middle_of(gains: np.ndarray) -> tuple[float, float]:
     return float(np.median(means)), float(np.diff(means[ends])[0] / 2)
 
 
-def _counts(gains: np.ndarray, confidence: float) -> bool:
+def _counts(gains: np.ndarray, max_chance: float) -> bool:
     middle, _ = middle_of(gains)
     order = np.argsort(np.abs(gains - middle), kind="stable")
     kept = gains[order[: len(gains) - int(TRIMMED * len(gains))]]
     if middle <= MIN_GAIN_DB:  # ranks of zeros have no deviation
         return False
     _, chance = cast("tuple[float, float]", wilcoxon(kept, alternative="greater"))
-    return bool(chance <= 1 - confidence)
+    return bool(chance <= max_chance)
 
 
 def _reject(finding: Finding, reason: str = "") -> Decision:
-    effect, evidence = finding.effect, finding.evidence + reason
-    return Decision(
-        effect=effect, evidence=evidence, changes=finding.changes, advice=finding.advice
-    )
+    row = {name: getattr(finding, name) for name in ("effect", "changes", "advice")}
+    return Decision(evidence=finding.evidence + reason, **row)
 
 
 def _reason_not_examined(config: FitConfig, dataset: Dataset) -> str:
-    count, least = (
-        len(dataset.train),
-        round(short_fits.MIN_ITERATIONS / short_fits.SHARE_OF_ITERATIONS),
-    )
+    count, least = len(dataset.train), short_fits.MIN_ITERATIONS_OF_FIT
     if count < MIN_VIEWS:
         return f"{count} training photographs are fewer than {MIN_VIEWS}"
     if config.iterations < least:
@@ -294,48 +291,28 @@ def _findings(fit: ShortFit) -> Iterator[Finding]:
     """Yield the findings of what is shipped and of installed extensions."""
     effects = sorted((extension.value for extension in EFFECTS.all()), key=lambda e: e.order)
     looks = [_look_for_background, look_for_bad_photographs, *(e.look_for for e in effects)]
-    _, share = _border_colors((*fit.dataset.train, *fit.dataset.test))
     for look in (*looks, look_for_moving_things):
         found = look(fit)
-        for one in [found] if isinstance(found, Finding) else found or ():
-            if one.effect == "vignetting" and one.is_likely and share >= MIN_BORDER_SHARE:
-                text = f"{one.evidence}, as before another background; photograph a wall to tell"
-                yield replace(one, evidence=text, is_likely=False)
-            else:
-                yield one
-
-
-def _border_colors(views: Sequence[View]) -> tuple[np.ndarray, float]:
-    """Return the colours (V, 3) of opaque photographs' borders, and which share of them is alike.
-
-    Photographs with transparency or masks have none.
-    """
-    if any(view.alpha is not None or view.mask is not None for view in views):
-        return np.empty((0, 3)), 0.0
-    borders = [_border(np.asarray(view.image)) for view in views]
-    colors = np.array([np.median(border, axis=0) for border in borders])
-    deviations = [border - color for border, color in zip(borders, colors, strict=True)]
-    alike = (np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1)
-    return colors, float(alike.mean())
+        yield from [found] if isinstance(found, Finding) else found or ()
 
 
 def _look_for_background(fit: ShortFit) -> Finding | None:
     """Compare each pixel at the border of opaque photographs with the median of its border."""
-    colors, share = _border_colors((*fit.dataset.train, *fit.dataset.test))
-    if not len(colors):
+    views = (*fit.dataset.train, *fit.dataset.test)
+    if any(view.alpha is not None or view.mask is not None for view in views):
         return None
+    borders = [_border(np.asarray(view.image)) for view in views]
+    colors = np.array([np.median(border, axis=0) for border in borders])
+    deviations = [border - color for border, color in zip(borders, colors, strict=True)]
+    share = float((np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1).mean())
     color = np.median(colors, axis=0)
     spread = np.median(np.abs(colors - color), axis=0)  # by exposure
     other = np.abs(color - fit.config.data.background_rgb) - 3 * spread
-    is_other = other.max() > BORDER_TOLERANCE
-    background = tuple(round(float(value), 3) for value in color)
-    shown = ", ".join(f"{value:.2f}" for value in background)
-    return Finding(
-        "background of one colour",
-        f"{share:.0%} of each border has one colour, mostly {shown}",
-        is_likely=share >= MIN_BORDER_SHARE and bool(is_other),
-        changes={"data.background": background},
-    )
+    is_likely = share >= MIN_BORDER_SHARE and bool(other.max() > BORDER_TOLERANCE)
+    shown = ", ".join(f"{value:.2f}" for value in color)
+    evidence = f"{share:.0%} of each border has one colour, mostly {shown}"
+    changes = {"data.background": tuple(round(float(value), 3) for value in color)}
+    return Finding("background of one colour", evidence, is_likely, changes)
 
 
 def _border(image: np.ndarray) -> np.ndarray:

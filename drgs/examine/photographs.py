@@ -76,10 +76,9 @@ def bad_photographs(fit: ShortFit) -> dict[str, str]:
     """Return the reasons by name; photographs of both groups, fitted and held out, are judged."""
     held_out = fit.dataset.test, fit.alignments, fit.images
     trained = fit.dataset.train[: len(fit.trained)], fit.trained, fit.trained_images
-    pairs = (
-        pair for views, _, images in (held_out, trained) for pair in zip(views, images, strict=True)
-    )
-    renderings, found = {view.name: image for view, image in pairs}, {}
+    renderings, found = {}, {}
+    for views, _, images in (held_out, trained):
+        renderings |= {view.name: image for view, image in zip(views, images, strict=True)}
     for views, alignments, images in (held_out, trained):
         if len(views) >= MIN_VIEWS:
             found |= _outliers(views, alignments, images, renderings)
@@ -96,17 +95,20 @@ def _outliers(
     softer = -_deviations([a.sharpness for a in alignments], LEAST_DEVIATIONS["sharpness"])
     full = np.array([(np.asarray(v.image).min(axis=2) > FULL).mean() for v in views])
     full -= [(image.min(axis=2) > FULL).mean() for image in images]
-    covered = _regions(alignments)
+    covered = _regions(alignments, is_of_border=True)
+    parts = (a.left[a.left > 0] if a.left.any() else np.ones(1) for a in alignments)
+    middles = [20 * float(np.log10(np.median(part))) for part in parts]
+    wide = _deviations(middles, LEAST_DEVIATIONS["psnr"]) > MAX_DEVIATIONS
     found = {}
     for index, (view, one) in enumerate(zip(views, alignments, strict=True)):
         is_bright = one.gains.mean() > MIN_BRIGHTER
         if is_bright and full[index] - np.median(full) > MIN_FULL_SHARE:
             found[view.name] = f"overexposed ({full[index]:.0%} of it is white)"
         elif worse[index] > MAX_DEVIATIONS:
-            found[view.name] = _why_worse(view, renderings, covered[index])
-        if softer[index] > MAX_DEVIATIONS and found.get(view.name, ELSEWHERE) == ELSEWHERE:
+            found[view.name] = _why_worse(view, renderings, covered[index], wide[index])
+        if softer[index] > MAX_DEVIATIONS and found.get(view.name, "") in ("", ELSEWHERE):
             found[view.name] = f"blurred (steps x {np.exp(one.sharpness):.2f})"
-    return found
+    return {name: why for name, why in found.items() if why}
 
 
 def _deviations(values: Sequence[float], least: float) -> np.ndarray:
@@ -115,24 +117,35 @@ def _deviations(values: Sequence[float], least: float) -> np.ndarray:
     return off / max(NORMAL * float(np.median(np.abs(off))), least)
 
 
-def _why_worse(view: View, renderings: dict[str, np.ndarray], covered: float) -> str:
+def _why_worse(view: View, renderings: dict[str, np.ndarray], covered: float, wide: bool) -> str:
+    """Return the reason; empty if a part alone (not ``wide``) differs within: a reflection."""
     photograph = _thumbnail(np.asarray(view.image))
     alike = {name: float(np.mean(photograph * _thumbnail(r))) for name, r in renderings.items()}
     best = max(alike, key=alike.__getitem__)
     if alike[best] > max(MIN_SIMILARITY, alike[view.name] + MIN_ADVANTAGE):
         return f"swapped (resembles the view of {best})"
-    if COVERED_SHARES[0] < covered < COVERED_SHARES[1] and alike[view.name] > MIN_SIMILARITY:
-        return f"something before the camera ({covered:.0%} of it)"
-    return ELSEWHERE
+    if wide or alike[view.name] <= MIN_SIMILARITY:
+        return ELSEWHERE
+    is_covered = COVERED_SHARES[0] < covered < COVERED_SHARES[1]
+    return f"something before the camera ({covered:.0%} of it)" if is_covered else ""
 
 
-def _regions(alignments: Sequence[Alignment]) -> np.ndarray:
-    """Return the share of the largest connected region of pixels that differ, of each."""
+def _regions(alignments: Sequence[Alignment], is_of_border: bool = False) -> np.ndarray:
+    """Return the share of the largest connected region of pixels that differ, of each.
+
+    is_of_border: of regions that reach the border, in a width of the root of their area.
+    """
     medians = [np.median(one.left[one.left > 0]) for one in alignments if one.left.any()]
-    least = COVERED_DEVIATIONS * np.median(medians or [1.0])
-    differs = [ndimage.uniform_filter(one.left, 3) > least for one in alignments]
-    labels = [cast("tuple[np.ndarray, int]", ndimage.label(each))[0] for each in differs]
-    return np.array([max(np.bincount(each.ravel())[1:], default=0) / each.size for each in labels])
+    least, shares = COVERED_DEVIATIONS * np.median(medians or [1.0]), []
+    for one in alignments:
+        differs = ndimage.uniform_filter(one.left, 3) > least
+        labels, count = cast("tuple[np.ndarray, int]", ndimage.label(differs))
+        areas = np.bincount(labels.ravel())[1:]
+        if is_of_border:
+            border = np.concatenate([labels[[1, -2]].ravel(), labels[:, [1, -2]].ravel()])
+            areas = areas[np.bincount(border, minlength=count + 1)[1:] > np.sqrt(areas)]
+        shares.append(max(areas, default=0) / labels.size)
+    return np.array(shares)
 
 
 def _thumbnail(image: np.ndarray) -> np.ndarray:

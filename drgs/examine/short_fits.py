@@ -24,22 +24,22 @@ from drgs.training.trainer import Trainer
 
 SHORT_FIT_WIDTH_PX = 135  # about: of photographs in short fits
 NUM_GAUSSIANS = 15_000
-SHARE_OF_ITERATIONS, MAX_ITERATIONS, MIN_ITERATIONS = 1 / 6, 500, 250
+SHARE_OF_ITERATIONS, MAX_ITERATIONS, MIN_ITERATIONS = 1 / 6, 400, 250
 """A short fit has this share of the fit's iterations, within these bounds; a fit that is shorter
 than six times the least is not examined."""
 
 MIN_ITERATIONS_OF_FIT = round(MIN_ITERATIONS / SHARE_OF_ITERATIONS)
 
 MAX_VIEWS = 160  # photographs of an examination
-NUM_HELD_OUT, HELD_OUT_STRIDE, FEW_HELD_OUT = 10, (4, 8), 20
-"""Photographs that are left out, about: one in four to one in eight. Below 50 photographs, so many
-folds leave out others that there are 20: of 20 photographs, each is left out once."""
+NUM_HELD_OUT, HELD_OUT_STRIDE, MAX_HELD_OUT = 10, (4, 8), 20
+"""Photographs that are left out, about: one in four to one in eight, and by so many folds that they
+are 20. Those after the first are fitted for an effect that it leaves undecided."""
 
 WARM_UP_ITERATIONS = 20  # of a short fit, whose time does not count: kernels are compiled
 
-TIMED_ITERATIONS, GROWTH, NUM_FITS = 10, 1.6, 2
-"""A plan for a given time: iterations that are timed; the time of later ones and of renderings,
-relative to these; and fits for which there must be time: with an effect and without."""
+TIMED_ITERATIONS, GROWTH = 10, 1.6
+"""Iterations by which the time of a short fit is predicted, and the time of later ones and of
+renderings, relative to these."""
 
 
 class OutOfTimeError(Exception):
@@ -52,48 +52,13 @@ def check_time(end: float) -> None:
         raise OutOfTimeError
 
 
-def plan_short_fits(
-    config: FitConfig, folds: Sequence[Dataset], end: float
-) -> tuple[FitConfig, Sequence[Dataset], str]:
-    """Return iterations and folds for which there is time, and what was made smaller.
-
-    config: of a short fit. Raises :class:`OutOfTimeError` if there is no time for the least.
-    """
-    if end == math.inf:
-        return config, folds, ""
-    trainer, started = _make_trainer(config, folds[0]), 0.0
-    for done in range(WARM_UP_ITERATIONS + TIMED_ITERATIONS):
-        check_time(end)
-        if done == WARM_UP_ITERATIONS:
-            dr.sync_thread()
-            started = time.perf_counter()
-        trainer.step()
-    trainer.check()
-    now = time.perf_counter()
-    trainer.release()
-    possible = int((end - now) / NUM_FITS / GROWTH / (now - started) * TIMED_ITERATIONS)
-    iterations, count = min(possible, config.iterations), max(1, possible // config.iterations)
-    if possible < MIN_ITERATIONS:
-        raise OutOfTimeError
-    if iterations == config.iterations and count >= len(folds):
-        return config, folds, ""
-    text = f"{iterations} of {config.iterations} iterations, {min(count, len(folds))} folds"
-    return with_iterations(config, iterations), folds[:count], text
-
-
 def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
-    """Return folds of the training photographs, small, and their divisor.
-
-    ``test`` of each fold are photographs that it leaves out; the first fold alone, unless
-    photographs are few.
-    """
+    """Return folds of training photographs, small, that leave their ``test`` out; the divisor."""
     views = evenly_spaced(dataset.train, MAX_VIEWS)
     factor = max(1, round(max(view.width for view in views) / SHORT_FIT_WIDTH_PX))
     stride = int(np.clip(len(views) // NUM_HELD_OUT, *HELD_OUT_STRIDE))
     small = [with_arrays(smaller_view(view, factor)) for view in views]
-    num_folds = 1
-    if stride == HELD_OUT_STRIDE[0]:
-        num_folds = min(stride, -(-FEW_HELD_OUT * stride // len(views)))
+    num_folds = min(stride, -(-MAX_HELD_OUT * stride // len(views)))
     folds = []
     for first in np.roll(np.arange(stride), -(stride // 2))[:num_folds]:
         train = tuple(view for index, view in enumerate(small) if index % stride != first)
@@ -102,57 +67,38 @@ def split_views(dataset: Dataset) -> tuple[list[Dataset], int]:
     return folds, factor
 
 
-def fit_folds(
+def fit_fold(
     config: FitConfig,
     folds: Sequence[Dataset],
+    number: int,
     factor: int,
     progress: Callable[[int, int], None],
     end: float = math.inf,
     with_trained: bool = False,
 ) -> ShortFit:
-    """Fit the training views of each fold, and render its test views; config: of a short fit.
+    """Fit the training views of a fold, and render its test views; config: of a short fit.
 
-    Photographs that it leaves out are fitted in no fold, and tested in the first. with_trained:
-    render the training views of the first fold as well.
-
-    Raises :class:`OutOfTimeError` after ``end``, by ``time.perf_counter``.
+    Photographs that the configuration leaves out are tested in the first fold. with_trained: render
+    the training views as well. Raises :class:`OutOfTimeError` after ``end``, by
+    ``time.perf_counter``.
     """
-    left_out, fits = {*config.data.leave_out}, []
-    for number, fold in enumerate(folds):
-        train = tuple(view for view in fold.train if view.name not in left_out)
-        others = () if number else tuple(view for view in fold.train if view.name in left_out)
-        split = replace(fold, train=train, test=(*fold.test, *others))
-
-        def step(done: int, before: int = number * config.iterations) -> None:
-            progress(before + done, config.iterations * len(folds))
-            check_time(end)
-
-        fits.append(_short_fit(config, split, factor, step, with_trained and number == 0))
-    return replace(
-        fits[0],
-        dataset=replace(fits[0].dataset, test=tuple(v for fit in fits for v in fit.dataset.test)),
-        images=[image for fit in fits for image in fit.images],
-        alignments=[alignment for fit in fits for alignment in fit.alignments],
-        wall_s=sum(fit.wall_s for fit in fits),
-    )
-
-
-def _short_fit(
-    config: FitConfig,
-    split: Dataset,
-    factor: int,
-    after_step: Callable[[int], None],
-    with_trained: bool,
-) -> ShortFit:
-    split = with_background(split, config)
+    left_out, fold = {*config.data.leave_out}, folds[number]
+    train = tuple(view for view in fold.train if view.name not in left_out)
+    others = () if number else tuple(view for view in fold.train if view.name in left_out)
+    split = with_background(replace(fold, train=train, test=(*fold.test, *others)), config)
     trainer = _make_trainer(config, split)
     started = time.perf_counter()
     while trainer.iteration < config.iterations:
         trainer.step()
-        after_step(trainer.iteration)
-        if trainer.iteration == WARM_UP_ITERATIONS:
+        progress(trainer.iteration, config.iterations)
+        check_time(end)
+        if trainer.iteration in (WARM_UP_ITERATIONS, WARM_UP_ITERATIONS + TIMED_ITERATIONS):
             dr.sync_thread()
-            started = time.perf_counter()
+            now, left = time.perf_counter(), config.iterations - trainer.iteration
+            if trainer.iteration == WARM_UP_ITERATIONS:
+                started = now
+            else:
+                check_time(end - GROWTH * left * (now - started) / TIMED_ITERATIONS)
     trainer.check()  # waits for the device
     wall_s, count = time.perf_counter() - started, len(split.test)
     views = (*split.test, *split.train) if with_trained else split.test
@@ -163,6 +109,20 @@ def _short_fit(
     gaussians = trainer.gaussians()
     trainer.release()
     return ShortFit(trainer.config, split, gaussians, *tested, factor, wall_s, *trained)
+
+
+def add_fold(
+    fit: ShortFit, folds: Sequence[Dataset], progress: Callable[[int, int], None], end: float
+) -> ShortFit:
+    """Return a fit with the test views of the next fold; the same errors."""
+    more = fit_fold(fit.config, folds, fit.num_folds, fit.factor, progress, end)
+    return replace(
+        fit,
+        dataset=replace(fit.dataset, test=(*fit.dataset.test, *more.dataset.test)),
+        images=[*fit.images, *more.images],
+        alignments=[*fit.alignments, *more.alignments],
+        num_folds=fit.num_folds + 1,
+    )
 
 
 def _make_trainer(config: FitConfig, split: Dataset) -> Trainer:

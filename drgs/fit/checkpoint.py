@@ -44,8 +44,9 @@ class Checkpoint:
 
 def save_checkpoint(folder: Path, config: FitConfig, checkpoint: Checkpoint) -> None:
     """Write or replace the checkpoint of an output folder, atomically, and a missing config.yml."""
+    values = config.model_dump(mode="json", exclude={"output", "stop_after"})  # these may change
     arrays = {
-        "config": np.array(_as_text(config)),
+        "config": np.array(json.dumps(values, sort_keys=True)),
         "history": checkpoint.history,
         "density": checkpoint.density,
         "wall_s": np.array(checkpoint.wall_s),
@@ -147,12 +148,6 @@ def _damaged_error(path: Path, error: Exception) -> UserError:
 
 def _remedy(path: Path) -> str:
     return f"remove {path} to start again from iteration 0"
-
-
-def _as_text(config: FitConfig) -> str:
-    """Return every value but where the output goes, how often it is written, and the last one."""
-    values = config.model_dump(mode="json", exclude={"output", "stop_after"})
-    return json.dumps(values, sort_keys=True)
 
 
 def _match_leaves(config: FitConfig, values: Mapping[str, object]) -> FitConfig:

@@ -51,12 +51,7 @@ def unless_ended(continues: Continues, requests: RenderRequests) -> Continues:
 class TrainingViewer(Observer):
     """Serves viewer clients during a fit: see :class:`drgs.fit.loop.Observer`."""
 
-    def __init__(
-        self,
-        requests: RenderRequests,
-        page: TrainingPage,
-        dataset: Dataset,
-    ) -> None:
+    def __init__(self, requests: RenderRequests, page: TrainingPage, dataset: Dataset) -> None:
         self._requests, self._page = requests, page
         self._background = dataset.background
         self._scheduler = RenderScheduler(

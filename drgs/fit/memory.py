@@ -125,12 +125,7 @@ def room_for_targets(config: FitConfig, dataset: Dataset, start: int, comm: Comm
 
 
 def _refusal(
-    config: FitConfig,
-    dataset: Dataset,
-    start: int,
-    memory: FitMemory,
-    usable: int,
-    processes: int,
+    config: FitConfig, dataset: Dataset, start: int, memory: FitMemory, usable: int, processes: int
 ) -> str:
     train = dataset.train
     count, width = max_num_gaussians(config, start), max(view.width for view in train)

@@ -47,29 +47,23 @@ def rank_photographs(
     views = [v for v in views if not (isinstance(v.image, LazyImage) and v.image.is_elsewhere)]
     if not views:
         return []
-    scores = list(map_ahead(_measure, zip(views, render(tuple(views)), strict=True)))
+    pairs = zip(views, render(tuple(views)), strict=True)
+    scores = list(map_ahead(lambda v, image: psnr(image, np.asarray(v.image), v.mask), pairs))
     order = sorted(range(len(views)), key=lambda index: scores[index])
     ranked = [RankedPhotograph(views[index].name, scores[index]) for index in order]
-    limit, worst = _outlier_limit(scores), tuple(views[index] for index in order[:NUM_HINTS])
+    off, worst = (
+        np.array(scores) - np.median(scores),
+        tuple(views[index] for index in order[:NUM_HINTS]),
+    )
+    limit = np.median(scores) - OUTLIER_DEVIATIONS * NORMAL * np.median(np.abs(off))
     for place, (view, image) in enumerate(zip(worst, render(worst), strict=True)):
         factor = max(1, round(view.width / WIDTH_PX))
         small = with_arrays(smaller_view(view, factor))
         image = downscale(image, small.width)
-        hint = _hint_at(small, image, factor, background, ranked[place].psnr < limit)
+        hint = _hint_at(small, image, factor, background, bool(ranked[place].psnr < limit))
         images = np.concatenate([np.asarray(small.image), image], axis=1)
         ranked[place] = replace(ranked[place], hint=hint, images=images)
     return ranked
-
-
-def _measure(view: View, image: np.ndarray) -> float:
-    return psnr(image, np.asarray(view.image), view.mask)
-
-
-def _outlier_limit(scores: Sequence[float]) -> float:
-    """Return the PSNR below which a photograph is far from the others, dB."""
-    median = np.median(scores)
-    deviation = NORMAL * np.median(np.abs(np.array(scores) - median))
-    return float(median - OUTLIER_DEVIATIONS * deviation)
 
 
 def _hint_at(

@@ -212,6 +212,7 @@ def write_report(
     """
     chosen, has_viewer = choose_views([s.psnr for s in scores]), path.with_name(VIEWER).is_file()
     ranked = rank_photographs(dataset.train, render, dataset.background)
+    first_frame = Image.open(io.BytesIO(orbit)).convert("RGB")
     template = resources.files("drgs.results").joinpath("page.html").read_text("utf-8")
     page = Template(template).substitute(
         title=html.escape(title),
@@ -220,7 +221,7 @@ def write_report(
         facts="".join(_row(*fact) for fact in _facts(dataset, metrics, history)),
         split=html.escape(dataset.test_split),
         orbit=_uri("image/webp", orbit),
-        still=_data_uri(_first_frame(orbit), lossless=True),
+        still=_data_uri(np.asarray(first_frame), lossless=True),
         gaussians=GAUSSIANS,
         viewers=_viewers(metrics),
         walk=f'<a href="{VIEWER}">Walk around in it</a>. ' if has_viewer else "",
@@ -336,11 +337,6 @@ def _curve(panel: Panel) -> str:
     """Return HTML of a curve."""
     source = _uri("image/svg+xml", draw_curve(panel).encode())
     return f'<img alt="{panel.title} over {panel.x_label}" src="{source}">'
-
-
-def _first_frame(animation: bytes) -> np.ndarray:
-    with Image.open(io.BytesIO(animation)) as image:
-        return np.asarray(image.convert("RGB"))
 
 
 def _tile(value: str, unit: str, label: str) -> str:

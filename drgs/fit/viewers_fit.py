@@ -59,9 +59,7 @@ def num_iterations(config: FitConfig) -> int:
 
 
 def for_viewers(
-    trainer: Trainer,
-    gaussians: Gaussians,
-    watch: Callable[[int], None] = lambda done: None,
+    trainer: Trainer, gaussians: Gaussians, watch: Callable[[int], None] = lambda done: None
 ) -> ForViewers:
     """Fit a copy of a fit's Gaussians as viewers render.
 

@@ -628,10 +628,7 @@ def composite_gradients(
 
 
 def project_gradients(
-    gaussians: Gaussians,
-    camera: Camera,
-    d_splats: dict[str, np.ndarray],
-    antialiased: bool = False,
+    gaussians: Gaussians, camera: Camera, d_splats: dict[str, np.ndarray], antialiased: bool = False
 ) -> dict[str, np.ndarray]:
     """Return the gradients with respect to means, quats, log_scales and logit_opacities.
 

@@ -10,10 +10,9 @@ image. :func:`align` finds the seven numbers by least squares, again after movin
 them (Lucas and Kanade 1981), with weights by which pixels with other differences count little
 (Cauchy's, Holland and Welsch 1977). What is left, it regresses on
 
-    (a s + p log r) r + b (x s dr/dx + y s dr/dy) + y (m dr/dx + n dr/dy), s = x^2 + y^2,
+    b (x s dr/dx + y s dr/dy) + y (m dr/dx + n dr/dy), s = x^2 + y^2,
 
-with the vignetting a, the response r^exp(p), the distortion b and the skews m, n of rows that are
-read one after the other.
+with the distortion b and the skews m, n of rows that are read one after the other.
 """
 
 from __future__ import annotations
@@ -26,12 +25,13 @@ from scipy import ndimage
 from drgs.datasets.types import View
 
 SIGMA_PX = 1.0  # of the blur before the derivatives, so that they hold for shifts of a pixel
-NUM_MOVES, NUM_REWEIGHTINGS = 4, 4
+NUM_MOVES, NUM_REWEIGHTINGS = 4, 4  # at most; and of each regression
+MIN_MOVE_PX = 0.03  # of the corners; smaller moves are the last
+MEDIAN_STRIDE = 7  # one in so many differences is among those whose median is taken
 MIN_SIDE_PX = 8  # of an image; smaller ones are not aligned
 MIN_COVERED = 0.5  # share of the image; a rendering that is moved farther is not aligned
 MAX_MOVE = 0.25  # of corners, half diagonals: farther ones are found where nothing is alike
 MIN_DEVIATION = 1e-6  # of the remaining differences, display space
-DARKEST = 0.02  # of colours whose logarithm is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +41,12 @@ class Alignment:
     gains: np.ndarray  # (3,): the photograph's brightness relative to the rendering's, minus 1
     shift: np.ndarray  # (2,) px: from the rendering's content to the photograph's
     psnr: float  # dB, of the rendering without these differences
-    toned_psnr: float  # dB, also without vignetting and response
-    vignetting: float  # brightness of corners relative to the middle's, minus 1
-    response: float  # logarithm of the exponent by which the photograph's colours differ
     zoom: float  # px at half the diagonal
     distortion: float  # px at half the diagonal, beyond the zoom
     skew: np.ndarray  # (2,) px at half the diagonal: shift of lower rows
     sharpness: float  # logarithm of the photograph's steps between pixels over the rendering's
-    left: np.ndarray  # (H, W) float32: RMS difference of each pixel that remains, masked ones 0
+    left: np.ndarray  # (H, W) float32: RMS difference of each pixel that remains
+    """Pixels that are masked, or show the background alone, have 0."""
 
 
 def align(
@@ -60,59 +58,58 @@ def align(
     behind a transparent photograph, display space, has no gain. Where the numbers do not make the
     images more alike, there are gains alone, by least squares, and in images below 8 px nothing.
     """
-    photograph = np.asarray(view.image, np.float64)
+    photograph = np.asarray(view.image, np.float32)
     height, width, _ = photograph.shape
-    counts = np.ones((height, width)) if view.mask is None else np.asarray(view.mask, np.float64)
-    behind = np.zeros(3)
+    counts = np.asarray(1.0 if view.mask is None else view.mask, np.float32)
+    counts = np.broadcast_to(counts, (height, width))
+    behind, is_opaque = np.zeros(3, np.float32), True
     if view.alpha is not None:
-        behind = (1 - np.asarray(view.alpha, np.float64)[..., None]) * np.array(background)
+        is_opaque = np.asarray(view.alpha) > 0
+        behind = np.asarray(background, np.float32) * (
+            1 - np.asarray(view.alpha, np.float32)[..., None]
+        )
     blur = SIGMA_PX, SIGMA_PX, 0
     blurred = ndimage.gaussian_filter(photograph, blur)
-    image, moved, gains = np.asarray(rendering, np.float64), np.zeros(4), np.zeros(3)
+    image, moved, gains = np.asarray(rendering, np.float32), np.zeros(4), np.zeros(3)
     before = _mean_error(photograph - image, counts)
     for _ in range(NUM_MOVES if min(height, width) >= MIN_SIDE_PX else 0):
         at, _ = _move(image, moved)
         smooth = ndimage.gaussian_filter(at, blur)
         base = ndimage.gaussian_filter(at - behind, blur)
-        directions = _directions(smooth, base)
-        numbers = _fit_numbers(directions, blurred - smooth, counts)
-        gains, moved = numbers[:3], moved + numbers[3:]
+        directions = [np.eye(3, dtype=np.float32)[:, None, None] * base, _directions(smooth)[:4]]
+        numbers = _fit_numbers(np.concatenate(directions), blurred - smooth, counts)
+        gains, moved = numbers[:3].astype(np.float32), moved + numbers[3:]
+        if np.abs(numbers[3:]).max() < MIN_MOVE_PX:
+            break
     at, is_covered = _move(image, moved)
-    seen, left, others = counts * is_covered, photograph - at - gains * (at - behind), np.zeros(8)
-    error = toned = _mean_error(left, seen)
+    seen, left, others = counts * is_covered, photograph - at - gains * (at - behind), np.zeros(5)
+    error = _mean_error(left, seen)
     if min(height, width) >= MIN_SIDE_PX:
-        base = (1 + gains) * (at - behind)
-        smooth = ndimage.gaussian_filter(left, blur)
-        others = _fit_numbers(_other_directions(base, at, blur), smooth, seen)
-        further = left - _other_directions(base, at, (0, 0, 0))[..., :3] @ others[:3]
-        if (after := _mean_error(further, seen)) < error:
-            left, toned = further, after
-    farthest = max(np.abs(moved).max(), np.abs(others[3:]).max()) / (np.hypot(width, height) / 2)
-    if is_covered.mean() < MIN_COVERED or farthest > MAX_MOVE or not toned < before:
-        moved, others = np.zeros(4), np.zeros(8)
+        directions = _directions(ndimage.gaussian_filter(at, blur))[2:]
+        others = _fit_numbers(directions, ndimage.gaussian_filter(left, blur), seen)
+    farthest = max(np.abs(moved).max(), np.abs(others).max()) / (np.hypot(width, height) / 2)
+    if is_covered.mean() < MIN_COVERED or farthest > MAX_MOVE or not error < before:
+        moved, others = np.zeros(4), np.zeros(5)
         at, seen, base = image, counts, image - behind
         weights = counts[..., None] * base * (min(height, width) >= MIN_SIDE_PX)
         gains = (weights * (photograph - image)).sum((0, 1)) / ((weights * base).sum((0, 1)) + 1e-9)
         left = photograph - image - gains * base
-        error = toned = _mean_error(left, seen)
+        error = _mean_error(left, seen)
     return Alignment(
         gains=gains,
         shift=moved[:2],
         psnr=-10 * float(np.log10(max(min(error, before), 1e-10))),
-        toned_psnr=-10 * float(np.log10(max(toned, 1e-10))),
-        vignetting=float(others[1]),
-        response=float(others[2]),
-        zoom=float(moved[2] + others[3]),
-        distortion=float(others[4]),
-        skew=others[5:7],
+        zoom=float(moved[2] + others[0]),
+        distortion=float(others[2]),
+        skew=others[3:],
         sharpness=float(np.log(_mean_step(photograph, seen) / _mean_step(at, seen))),
-        left=(np.sqrt(np.square(left).mean(axis=2)) * seen).astype(np.float32),
+        left=(np.sqrt(np.square(left).mean(axis=2)) * seen * is_opaque).astype(np.float32),
     )
 
 
 def _mean_error(difference: np.ndarray, counts: np.ndarray) -> float:
     """Return the mean square of differences (H, W, 3); counts: weights (H, W)."""
-    squares = np.square(difference).mean(axis=2)
+    squares = np.square(difference).mean(axis=2, dtype=np.float64)
     return float((squares * counts).sum() / max(counts.sum(), 1e-10))
 
 
@@ -127,9 +124,9 @@ def _mean_step(image: np.ndarray, counts: np.ndarray) -> float:
 
 
 def _coordinates(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y from the middle, (H, W), in units of half the diagonal."""
-    y, x = np.mgrid[:height, :width]
-    size = np.hypot(width, height) / 2
+    """Return x and y from the middle, (H, W) float32, in units of half the diagonal."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    size = float(np.hypot(width, height)) / 2
     return (x + 0.5 - width / 2) / size, (y + 0.5 - height / 2) / size
 
 
@@ -152,42 +149,36 @@ def _move(image: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.stack(planes, axis=2), is_there
 
 
-def _directions(image: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Return the derivatives of an image (H, W, 3) along the numbers, (H, W, 3, 7)."""
-    x, y = _coordinates(*image.shape[:2])
-    x, y = x[..., None], y[..., None]
-    dy, dx = np.gradient(image, axis=(0, 1))
-    gains = base[..., None] * np.eye(image.shape[2])
-    others = np.stack([dx, dy, x * dx + y * dy, x * dy - y * dx], axis=-1)
-    return np.concatenate([gains, others], axis=-1)
+def _directions(image: np.ndarray) -> np.ndarray:
+    """Return the derivatives of an image (H, W, 3) along the numbers, (7, H, W, 3).
 
-
-def _other_directions(
-    base: np.ndarray, image: np.ndarray, blur: tuple[float, float, float]
-) -> np.ndarray:
-    """Return derivatives (H, W, 3, 8).
-
-    They are along gain, vignetting, response, zoom, distortion, two skews, and a rotation, which
-    has explained a part of the skews.
+    They are along the shift, zoom, rotation, distortion and skews, of which the rotation has
+    explained a part.
     """
-    x, y = (each[..., None] for each in _coordinates(*base.shape[:2]))
-    s, tones = x * x + y * y, np.log(np.clip(image, DARKEST, 1))
-    gains = [ndimage.gaussian_filter(base * each, blur) for each in (np.ones_like(s), s, tones)]
-    dy, dx = np.gradient(ndimage.gaussian_filter(image, blur), axis=(0, 1))
+    x, y = (each[..., None] for each in _coordinates(*image.shape[:2]))
+    dy, dx = np.gradient(image, axis=(0, 1))
     outward = x * dx + y * dy
-    numbers = [*gains, outward, s * outward, y * dx, y * dy, x * dy - y * dx]
-    return np.stack(numbers, axis=-1)
+    lens = (x * x + y * y) * outward, y * dx, y * dy
+    return np.stack([dx, dy, outward, x * dy - y * dx, *lens])
 
 
 def _fit_numbers(directions: np.ndarray, difference: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the numbers (7,) of the robust regression; counts: weights (H, W)."""
-    a = directions.reshape(-1, directions.shape[-1])
-    b, given = difference.ravel(), np.repeat(counts.ravel(), difference.shape[-1])
-    weights, numbers = given, np.zeros(a.shape[1])
+    """Return the numbers (K,) of the robust regression.
+
+    directions: (K, H, W, 3); difference: (H, W, 3); counts: weights (H, W).
+    """
+    # Row by row, products are too small for threads of BLAS, of which each caller's would have its
+    # own.
+    a = directions.reshape(*directions.shape[:2], -1).transpose(1, 0, 2)  # (H, K, 3 W)
+    b, given = difference.reshape(len(a), -1), np.repeat(counts, difference.shape[-1], axis=1)
+    weights, is_counted = given, given.ravel()[::MEDIAN_STRIDE] > 0
+    numbers = np.zeros(a.shape[1])
     for _ in range(NUM_REWEIGHTINGS):
-        normal = (a * weights[:, None]).T @ a + 1e-9 * np.eye(a.shape[1])
-        numbers = np.linalg.solve(normal, a.T @ (weights * b))
-        left = np.abs(b - a @ numbers)
-        deviation = 1.4826 * np.median(left[given > 0]) if given.any() else 0.0
+        weighted = a * weights[:, None]
+        normal = (weighted @ a.transpose(0, 2, 1)).sum(0, np.float64) + 1e-9 * np.eye(a.shape[1])
+        numbers = np.linalg.solve(normal, (weighted @ b[..., None]).sum(0, np.float64)[:, 0])
+        left = np.abs(b - numbers.astype(np.float32) @ a)
+        some = left.ravel()[::MEDIAN_STRIDE][is_counted]
+        deviation = 1.4826 * float(np.median(some)) if some.size else 0.0
         weights = given / (1 + np.square(left / (2 * deviation + MIN_DEVIATION)))
     return numbers

@@ -251,11 +251,7 @@ def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
 
 
 def _check_removable(
-    folder: Path,
-    record: FolderRecord,
-    foreign: list[str],
-    files: list[str],
-    images: Sequence[str],
+    folder: Path, record: FolderRecord, foreign: list[str], files: list[str], images: Sequence[str]
 ) -> None:
     """Raise :class:`UserError` for the names ``foreign`` and files that no fit has written."""
     if record.exists:

@@ -136,11 +136,12 @@ def viewer_page(
     splats = in_file.of_gaussians(gaussians).to_bytes("compressed-ply")
     files = resources.files("drgs.results")
     program = files.joinpath("supersplat_viewer")
+    scene = json.dumps(_scene(shown.approximations, initial_view, background))
     page = Template(files.joinpath("viewer_page.html").read_text("utf-8")).substitute(
         title=html.escape(title),
         licence=program.joinpath("LICENSE").read_text("utf-8"),
         style=program.joinpath("viewer.css").read_text("utf-8"),
-        scene=_in_script(_scene(shown.approximations, initial_view, background)),
+        scene=scene.replace("<", "\\u003c"),  # does not end the script element
         code=_base64(program.joinpath("viewer.js.gz").read_bytes()),
         splats=_base64(gzip.compress(splats, GZIP_LEVEL, mtime=0)),
     )
@@ -219,11 +220,6 @@ def _settings(position: np.ndarray, background: tuple[float, float, float]) -> M
         "annotations": [],
         "startMode": "default",
     }
-
-
-def _in_script(values: Mapping[str, object]) -> str:
-    """Return JSON that cannot end the script element."""
-    return json.dumps(values).replace("<", "\\u003c")
 
 
 def _base64(data: bytes) -> str:

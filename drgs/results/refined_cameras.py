@@ -27,7 +27,8 @@ def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
     try:
         found = json.loads(read_text(path, "refined cameras", MAX_BYTES))
         change = LensChange(**{k: tuple(v) for k, v in found["lens_change"].items()})
-        poses = {f["file_path"]: _opencv_pose(f["transform_matrix"]) for f in found["frames"]}
+        rows = {f["file_path"]: np.array(f["transform_matrix"], float) for f in found["frames"]}
+        poses = {k: between_opencv_and_opengl(v.reshape(4, 4)) for k, v in rows.items()}
         for pose in poses.values():
             pose[:3, 3] -= dataset.origin
         train = [change.apply(_with_pose(view, poses[view.name])) for view in dataset.train]
@@ -59,10 +60,6 @@ def training_cameras(folder: Path, origin: Origin) -> list[Viewpoint] | None:
 
 def _read_relative(path: Path, origin: Origin) -> list[Viewpoint]:
     return [view.with_offset(-np.array(origin)) for view in read_viewpoints(path, None)]
-
-
-def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
-    return between_opencv_and_opengl(np.array(rows, np.float64).reshape(4, 4))
 
 
 def _with_pose(view: View, camera_to_world: np.ndarray) -> View:

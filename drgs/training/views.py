@@ -29,11 +29,7 @@ class TrainingView:
     """
 
     def __init__(
-        self,
-        view: View,
-        index: int,
-        sensor: mi.Sensor,
-        effects: Sequence[TrainingEffect],
+        self, view: View, index: int, sensor: mi.Sensor, effects: Sequence[TrainingEffect]
     ) -> None:
         """index: among the training views"""
         self.name, self.width, self.height = view.name, view.width, view.height

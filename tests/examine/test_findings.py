@@ -7,26 +7,26 @@ import numpy as np
 import pytest
 from support.small_capture import make_dataset
 
+from drgs.effects.base import Finding
 from drgs.effects.cameras import CameraRefinement
-from drgs.effects.photometry import Photometry
-from drgs.examine.examination import Decision, Examination, decide
+from drgs.examine import short_fits
+from drgs.examine.examination import Decision, Examination, _try
 from drgs.examine.photographs import look_for_moving_things
 
-NOISE = {"vignetting": 0.01, "response": 0.02, "zoom": 0.1, "distortion": 0.3, "skew": 0.05}
+NOISE = {"zoom": 0.1, "distortion": 0.3, "skew": 0.05}
+
+MEASURED = Finding("mine", "seen", False, {"mine.rate": 1}, is_measured=True)
+TRIED = Finding("mine", "seen", False, {"mine.rate": 1})
 
 
-def fit_with(num_cameras=1, sh_direction="mean", **middles):
-    """A short fit of 24 views whose differences vary around these middles.
-
-    A pair is of the first and of the second camera.
-    """
+def fit_with(sh_direction="mean", **middles):
+    """A short fit of 24 views whose differences vary around these middles."""
     rng, views, alignments = np.random.default_rng(0), make_dataset(24).train, []
-    views = [replace(view, fx=view.fx + k % num_cameras) for k, view in enumerate(views)]
     for k in range(len(views)):
-        values = {}
-        for name, noise in NOISE.items():
-            middle = np.broadcast_to(middles.get(name, 0.0), 2)[k % num_cameras % 2]
-            values[name] = middle + noise * rng.normal()
+        values = {
+            name: middles.get(name, 0.0) + middles.get(f"{name}_noise", noise) * rng.normal()
+            for name, noise in NOISE.items()
+        }
         skew = np.array([values["skew"] * rng.choice([-1, 1]), 0.05 * rng.normal()])
         left = np.full((24, 32), 0.01, np.float32)
         if k < middles.get("moving", 0):
@@ -48,24 +48,6 @@ def by_name(findings):
     return {finding.effect: finding for finding in findings}
 
 
-@pytest.mark.parametrize(("corners", "is_likely"), [(0.0, False), (-0.02, True), (0.02, False)])
-def test_darker_corners_are_worth_a_fit_that_confirms_them(corners, is_likely):
-    (found,) = Photometry.look_for(fit_with(vignetting=corners))
-    assert found.effect == "vignetting" and found.is_likely is is_likely
-    assert found.changes == {"colors.vignetting_lr": 0.03} and found.confirm is not None
-    assert found.confirm(fit_with(vignetting=-0.03)) is None
-    confirmed = found.confirm(fit_with(vignetting=-0.25))
-    assert confirmed is not None and confirmed.evidence.startswith("corners are darker by 2")
-
-
-def test_responses_are_compared_between_cameras():
-    for tones, is_likely in (((0.0, 0.0), False), ((0.04, -0.04), True)):
-        found = by_name(Photometry.look_for(fit_with(2, response=tones)))["response"]
-        assert found.is_likely is is_likely, found.evidence
-        assert (found.confirm(fit_with(2, response=tones)) is not None) is is_likely
-    assert Photometry.look_for(fit_with(24)) == []  # a camera for each photograph
-
-
 @pytest.mark.parametrize(
     ("middles", "expected"),
     [
@@ -74,6 +56,7 @@ def test_responses_are_compared_between_cameras():
         ({"zoom": -0.5}, {"focal length"}),
         ({"distortion": 0.8}, {"distortion"}),
         ({"skew": 0.7}, {"rolling shutter"}),
+        ({"skew": 0.7, "zoom_noise": 0.6}, set()),
     ],
 )
 def test_lenses_and_shutters_differ_in_the_middle_of_all_photographs(middles, expected):
@@ -91,30 +74,48 @@ def test_things_that_move_are_said_if_many_photographs_have_them(count, is_said)
     assert found.evidence.startswith(f"{count / 24:.0%} of photographs")
 
 
-def test_what_is_confirmed_may_lose_a_little():
-    (found,) = Photometry.look_for(fit_with(vignetting=-0.02))
-    for loss, chosen in ((0.2, True), (0.8, False)):
-        config = SimpleNamespace(data=SimpleNamespace(leave_out=[]))
-        dataset = SimpleNamespace(test=make_dataset(10).train)
-        without, fitted = (
-            SimpleNamespace(
-                config=config,
-                dataset=dataset,
-                psnr=np.zeros(10),
-                toned_psnr=np.full(10, psnr),
-                wall_s=1.0,
-            )
-            for psnr in (30.0, 30.0 - loss)
+def test_what_is_measured_is_chosen_without_a_fit():
+    decision, base = _try(replace(MEASURED, is_likely=True), None, (), None, 0.0)
+    assert (decision.chosen, decision.gain, base) == (True, None, None)
+    assert not _try(MEASURED, None, (), None, 0.0)[0].chosen
+    found = Examination((decision,), 10, 1.0)
+    assert found.reasons == {"mine.rate": "seen"} and found.changes == {"mine.rate": 1}
+    assert "mine    seen                      mine.rate: 1" in str(found)
+
+
+def test_folds_are_added_until_an_effect_is_decided(monkeypatch):
+    views, added = make_dataset(20).train, []
+
+    def fit(gain, num_folds=1):
+        return SimpleNamespace(
+            config=SimpleNamespace(data=SimpleNamespace(leave_out=[])),
+            dataset=SimpleNamespace(test=views[: 5 * num_folds]),
+            psnr=30.0 + gain + 0.001 * np.arange(5 * num_folds),
+            wall_s=1.0,
+            factor=1,
+            num_folds=num_folds,
+            gain=gain,
         )
-        assert decide(found, without, fitted).chosen is chosen
+
+    def add_fold(one, *args):
+        added.append(one.gain)
+        return fit(one.gain, one.num_folds + 1)
+
+    for gain, more in ((-0.2, 0), (0.04, 0), (0.2, 1), (0.06, 1)):
+        added.clear()
+        monkeypatch.setattr(short_fits, "fit_fold", lambda *args, gain=gain: fit(gain))
+        monkeypatch.setattr(short_fits, "add_fold", add_fold)
+        monkeypatch.setattr("drgs.examine.examination.with_changes", lambda config, changes: config)
+        decision, base = _try(replace(TRIED, is_likely=True), fit(0.0), (None,) * 2, None, np.inf)
+        assert added == [0.0, gain] * more and base.num_folds == 1 + more
+        assert decision.chosen is (gain > 0.05)
 
 
 def test_bad_photographs_are_offered_although_no_gain_counts():
     changes = {"data.leave_out": ["a", "b"]}
     row = {"effect": "bad photographs", "evidence": "a is blurred", "changes": changes}
     tried = Decision(**row, gain=0.01, spread=0.02, cost=1.0, advice="--leave-out a --leave-out b")
-    found = Examination((tried,), 10, 1.0, smaller="300 of 500 iterations, 1 folds")
+    found = Examination((tried,), 10, 1.0)
     assert found.bad_photographs == ["a", "b"] and found.changes == {}
     assert "--leave-out a --leave-out b" in str(found)
-    assert "held-out views (within --budget: 300 of 500 iterations, 1 folds):" in str(found)
     assert Examination((Decision(**row),), 10, 1.0).bad_photographs == []

@@ -95,6 +95,16 @@ def test_good_photographs_are_not_named(clean):
     assert bad_photographs(few) == {}
 
 
+def test_a_reflection_inside_a_photograph_is_not_before_the_camera(clean):
+    views, images = [*clean[0]], clean[1]
+    image = views[3].image.copy()
+    image[6:18, 6:20] += 0.5
+    views[3] = replace(views[3], image=np.clip(image, 0, 1))
+    fit = judged(views, images)
+    assert fit.trained[3].psnr < min(each.psnr for k, each in enumerate(fit.trained) if k != 3) - 5
+    assert bad_photographs(fit) == {}
+
+
 def test_many_bad_photographs_are_no_single_ones(clean):
     views, images = [*clean[0]], clean[1]
     for k in range(5):

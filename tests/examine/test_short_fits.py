@@ -1,6 +1,5 @@
 """Short fits within a given time, with a clock that is known."""
 
-from itertools import count
 from types import SimpleNamespace
 
 import pytest
@@ -10,44 +9,44 @@ import drgs
 from drgs.config.load import config_from
 from drgs.datasets import load_dataset
 from drgs.examine import short_fits
-from drgs.examine.short_fits import OutOfTimeError, plan_short_fits, shorten, split_views
+from drgs.examine.short_fits import OutOfTimeError, fit_fold, shorten, split_views
 from drgs.fit.budget import Budget
 from drgs.fit.session import FitSession
-from drgs.initialization.defaults import resolve_defaults
 
 
-@pytest.fixture
-def plan_for(monkeypatch):
-    """Return the plan for some seconds, where a look at the clock takes 0.1 s, and nothing else."""
-    dataset = make_dataset(40)
-    values = {"iterations": 3000, "init": {"num_points": 60, "half_extent": 0.6}}
-    config = config_from({"data": {"path": "."}, **values}, "test")
-    config, (folds, _) = shorten(resolve_defaults(config, dataset)), split_views(dataset)
-
-    def plan(seconds):
-        ticks = count()
-        clock = SimpleNamespace(perf_counter=lambda: 0.1 * next(ticks))
-        monkeypatch.setattr(short_fits, "time", clock)
-        config_then, folds_then, smaller = plan_short_fits(config, folds, seconds)
-        return config_then.iterations, len(folds_then), smaller
-
-    return plan
+class FinishedError(Exception):
+    """All steps were taken."""
 
 
-def test_an_examination_is_as_large_as_there_is_time(plan_for):
-    assert plan_for(float("inf")) == plan_for(1000.0) == (500, 2, "")
-    # 10 iterations look at the clock 10 times: 0.16 s each, as they grow; and two short fits.
-    iterations, folds, smaller = plan_for(200.0)
-    assert (iterations, folds, smaller) == (500, 1, "500 of 500 iterations, 1 folds")
-    iterations, folds, smaller = plan_for(120.0)
-    assert iterations == pytest.approx((120 - 3.2) / 2 / 0.16, abs=2) and folds == 1
-    assert smaller == f"{iterations} of 500 iterations, 1 folds"
+def fit_within(monkeypatch, seconds, seconds_of_step):
+    """Fit a fold by a trainer whose steps take so long; return the number of steps that it took."""
+    clock, steps = [0.0], []
+
+    class Stub:
+        iteration = property(lambda self: len(steps))
+
+        def step(self):
+            steps.append(clock[0])
+            clock[0] += seconds_of_step
+
+        def check(self):
+            raise FinishedError
+
+    monkeypatch.setattr(short_fits, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(short_fits, "_make_trainer", lambda config, split: Stub())
+    config = shorten(config_from({"data": {"path": "."}, "iterations": 3000}, "test"))
+    folds, factor = split_views(make_dataset(40))
+    with pytest.raises((OutOfTimeError, FinishedError)) as raised:
+        fit_fold(config, folds, 0, factor, lambda done, count: None, seconds)
+    return len(steps), raised.type is OutOfTimeError
 
 
-@pytest.mark.parametrize("seconds", [80.0, 0.5])
-def test_without_time_for_the_least_there_is_none(plan_for, seconds):
-    with pytest.raises(OutOfTimeError):
-        plan_for(seconds)
+def test_a_short_fit_ends_as_soon_as_there_is_no_time_for_it(monkeypatch):
+    assert fit_within(monkeypatch, float("inf"), 0.1) == (400, False)
+    # 30 iterations have taken 3 s; 370, which grow, take 59.
+    assert fit_within(monkeypatch, 62.5, 0.1) == (400, False)
+    assert fit_within(monkeypatch, 62.0, 0.1) == (30, True)
+    assert fit_within(monkeypatch, 2.05, 0.1) == (21, True)
 
 
 def test_an_examination_that_takes_too_long_is_none_and_says_so():

@@ -173,10 +173,7 @@ class ProbeTransport(SplatTransport):
 
     @staticmethod
     def from_splats(
-        splats: SplatsState,
-        scene: mi.Scene,
-        num_paths: int,
-        sensors: Sequence[mi.Sensor],
+        splats: SplatsState, scene: mi.Scene, num_paths: int, sensors: Sequence[mi.Sensor]
     ) -> ProbeTransport:
         """Return the transport by probes; sensors: of flat mirrors. PluginError for unknown ids."""
         objects = _objects(scene, splats.lighting.probes)

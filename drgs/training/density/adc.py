@@ -47,9 +47,7 @@ class AdcConfig(Section):
         "norm, in NDC units, over the views that it is visible in.",
     )
     clone_scale: float = Field(
-        0.01,
-        gt=0,
-        description="Clone up to this largest scale, split above it; in scene extents.",
+        0.01, gt=0, description="Clone up to this largest scale, split above it; in scene extents."
     )
     split_count: int = Field(
         2, ge=2, le=1_000_000, description="Number of samples that replace a split Gaussian."

@@ -50,9 +50,7 @@ class McmcConfig(Section):
     """The strategy ``mcmc`` (Kheradmand et al. 2024): relocation, noise and regularisers."""
 
     gaussians: Resolved[Count] = Field(
-        UNRESOLVED,
-        ge=4,
-        description="Final number of Gaussians. null: as with budget.",
+        UNRESOLVED, ge=4, description="Final number of Gaussians. null: as with budget."
     )
     growth: float = Field(
         0.05, ge=0, le=10, description="Relative growth of the population at each change."
