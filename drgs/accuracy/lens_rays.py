@@ -28,8 +28,8 @@ J: both are those of the mean. The mean's place is therefore taken as constant i
 the moments are also the derivatives with respect to the mean's place, which densification uses.
 Rays depend on the lens, and on the motion: see :meth:`LensRayFalloff.along`.
 
-**Extent.** The rays at which alpha is the smallest are an elliptic cone. Sixteen of them are seen on
-the film; an ellipse through these, enlarged by their deviations from it, is the outline.
+**Extent.** The rays at which alpha is the smallest are an elliptic cone. Sixteen are seen on the
+film; an ellipse through these, enlarged by their deviations from it, is the outline.
 """
 
 from __future__ import annotations

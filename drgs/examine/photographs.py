@@ -96,16 +96,13 @@ def _outliers(
     full = np.array([(np.asarray(v.image).min(axis=2) > FULL).mean() for v in views])
     full -= [(image.min(axis=2) > FULL).mean() for image in images]
     covered = _regions(alignments, is_of_border=True)
-    parts = (a.left[a.left > 0] if a.left.any() else np.ones(1) for a in alignments)
-    middles = [20 * float(np.log10(np.median(part))) for part in parts]
-    wide = _deviations(middles, LEAST_DEVIATIONS["psnr"]) > MAX_DEVIATIONS
     found = {}
     for index, (view, one) in enumerate(zip(views, alignments, strict=True)):
         is_bright = one.gains.mean() > MIN_BRIGHTER
         if is_bright and full[index] - np.median(full) > MIN_FULL_SHARE:
             found[view.name] = f"overexposed ({full[index]:.0%} of it is white)"
         elif worse[index] > MAX_DEVIATIONS:
-            found[view.name] = _why_worse(view, renderings, covered[index], wide[index])
+            found[view.name] = _why_worse(view, renderings, covered[index])
         if softer[index] > MAX_DEVIATIONS and found.get(view.name, "") in ("", ELSEWHERE):
             found[view.name] = f"blurred (steps x {np.exp(one.sharpness):.2f})"
     return {name: why for name, why in found.items() if why}
@@ -117,14 +114,14 @@ def _deviations(values: Sequence[float], least: float) -> np.ndarray:
     return off / max(NORMAL * float(np.median(np.abs(off))), least)
 
 
-def _why_worse(view: View, renderings: dict[str, np.ndarray], covered: float, wide: bool) -> str:
-    """Return the reason; empty if a part alone (not ``wide``) differs within: a reflection."""
+def _why_worse(view: View, renderings: dict[str, np.ndarray], covered: float) -> str:
+    """Return the reason; empty if a part differs that does not reach the border: a reflection."""
     photograph = _thumbnail(np.asarray(view.image))
     alike = {name: float(np.mean(photograph * _thumbnail(r))) for name, r in renderings.items()}
     best = max(alike, key=alike.__getitem__)
     if alike[best] > max(MIN_SIMILARITY, alike[view.name] + MIN_ADVANTAGE):
         return f"swapped (resembles the view of {best})"
-    if wide or alike[view.name] <= MIN_SIMILARITY:
+    if alike[view.name] <= MIN_SIMILARITY:
         return ELSEWHERE
     is_covered = COVERED_SHARES[0] < covered < COVERED_SHARES[1]
     return f"something before the camera ({covered:.0%} of it)" if is_covered else ""
