@@ -94,15 +94,15 @@ FINEST_CUT_OFFS = cut_offs(1e-5, 1e-7)
 
 def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:
     """Return the projections that the cameras' lenses allow, the most accurate one last."""
-    ewa, unscented = Level({"projection": "ewa"}, 1), Level({"projection": "unscented"}, 1.15, 1.03)
+    ewa, unscented = Level({"projection": "ewa"}, 1), Level({"projection": "unscented"}, 1.05, 1.01)
     if any(camera.shutter is not None and camera.shutter.reads_rows for camera in cameras):
-        return ewa, unscented, Level({"projection": "exact"}, 2.6, 1.6)
+        return ewa, unscented, Level({"projection": "exact"}, 3.6, 1.8)
     if all(isinstance(camera.lens, Pinhole) for camera in cameras):
         return ewa, Level({"projection": "exact"}, 1.2, 1.05)
     if all(camera.lens.parallel for camera in cameras):
         # Along parallel rays, projected Gaussians are Gaussians.
         return (ewa,)
-    return ewa, unscented, Level({"projection": "exact"}, 2.0, 1.4)
+    return ewa, unscented, Level({"projection": "exact"}, 2.4, 1.6)
 
 
 def shutter_samples(cameras: Sequence[Camera]) -> tuple[Level, ...]:

@@ -28,7 +28,7 @@ J: both are those of the mean. The mean's place is therefore taken as constant i
 the moments are also the derivatives with respect to the mean's place, which densification uses.
 Rays depend on the lens, and on the motion: see :meth:`LensRayFalloff.along`.
 
-**Extent.** The rays at which alpha is the smallest are an elliptic cone. Sixteen are seen on the
+**Extent.** The rays at which alpha is the smallest are an elliptic cone. Some are seen on the
 film; an ellipse through these, enlarged by their deviations from it, is the outline.
 """
 
@@ -50,6 +50,7 @@ from drgs.accuracy.peaks import (
     seen_along,
 )
 from drgs.cameras.camera import Camera
+from drgs.cameras.lens import Perspective
 from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
 from drgs.core.types import Array2f, Array3f, Bool, Float
@@ -63,7 +64,7 @@ from drgs.splatting.footprint import (
 from drgs.splatting.grid import Lanes
 from drgs.splatting.projection import FilmShape, GaussianRows, RayTerms, Splats2D, factor_conic
 
-NUM_OUTLINE_POINTS = 16
+NUM_OUTLINE_POINTS, NUM_WIDE_POINTS = 8, 16  # the latter for lenses that show more than a half
 MAX_OUTLINE_DEVIATION = 1.5  # of the farthest point from the nearest; beyond, there is no outline
 OUTLINE_MARGIN = 0.01  # of rounding
 MIN_OUTLINE_VARIANCE = 1e-4  # px^2
@@ -229,7 +230,8 @@ class LensRayFalloff(GaussianFalloff):
         x, y = geometry[:2]
         t, splat, lens = types_of(type(x)), _SplatRows.unpack(geometry), self.camera.lens
         contour = splat.cylinder if lens.parallel else splat.cone
-        points, bounded = contour(reach, NUM_OUTLINE_POINTS)
+        is_wide = not isinstance(lens, Perspective)
+        points, bounded = contour(reach, NUM_WIDE_POINTS if is_wide else NUM_OUTLINE_POINTS)
         place, offsets = t.Array2f(x, y), []
         for point in points:
             at, position = self._where_read(point, splat.origin)

@@ -357,7 +357,7 @@ def main() -> None:
     text = f"{machine()}\n\n{markdown_table(header, table)}\n"
     judged = [row for row in table if row[3]]
     kept = sum(int(row[3].split()[0]) for row in judged)
-    worst = max(float(row[4]) for row in judged)
+    worst = max((float(row[4]) for row in judged), default=0.0)
     text += f"\n{kept} of {len(judged) * NUM_JUDGED} views are within, the worst {worst:.2f}.\n"
     if args.out:
         args.out.write_text(text)
