@@ -65,7 +65,7 @@ from drgs.splatting.grid import Lanes
 from drgs.splatting.projection import FilmShape, GaussianRows, RayTerms, Splats2D, factor_conic
 
 NUM_OUTLINE_POINTS, NUM_WIDE_POINTS = 8, 16  # the latter for lenses that show more than a half
-MAX_OUTLINE_DEVIATION = 1.5  # of the farthest point from the nearest; beyond, there is no outline
+MAX_OUTLINE_DEVIATION = 1.5  # farthest point over nearest; up to it, outlines hold 30,000 cones
 OUTLINE_MARGIN = 0.01  # of rounding
 MIN_OUTLINE_VARIANCE = 1e-4  # px^2
 

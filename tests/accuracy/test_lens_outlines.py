@@ -38,7 +38,9 @@ def test_wide_splats_are_cut_off_only_where_they_are_faint(lens):
         scales = np.linalg.norm(means) * rng.uniform(0.1, 0.8, (1, 3))
         values = means, scales, rng.normal(size=(1, 4))
         all_of_it, shown = (alpha(lens, *values, cut) for cut in (1e-6, ALPHA_CUT))
-        expected = np.where(all_of_it >= ALPHA_CUT * 1.01, all_of_it, 0)
+        expected = np.where(all_of_it >= ALPHA_CUT, all_of_it, 0)
+        # Rounding may move an alpha across the cut, by less than 1 % of it; elsewhere, both images
+        # evaluate one formula in float32, in kernels that may contract differently: 1e-5.
         is_clear = np.abs(all_of_it / ALPHA_CUT - 1) > 0.01
         np.testing.assert_allclose(shown[is_clear], expected[is_clear], rtol=0, atol=1e-5)
         seen += bool(shown.any())
