@@ -23,8 +23,8 @@ NORMAL = 1.4826  # standard deviation over the median absolute one, of a normal 
 
 MAX_SHOWN, MAX_SHARE = 4, 0.15  # photographs in the table; of all, or they are no single ones
 
-MAX_DEVIATIONS = 5.0
-"""Normal deviations from the middle: photographs that differ by more are bad."""
+MAX_DEVIATIONS, CONFIRMED = 5.0, 3.0
+"""Normal deviations from the middle: photographs that differ by more are bad; without them, too."""
 
 LEAST_DEVIATIONS = {"psnr": 0.8, "sharpness": 0.06}
 """Deviations (dB; logarithm of steps between pixels), where photographs are more alike."""
@@ -40,9 +40,9 @@ MANY = 0.3  # of the photographs, with such regions: things move
 
 ELSEWHERE = "of another place, or its pose is wrong"
 
-SIDE_PX, MIN_SIMILARITY, MIN_ADVANTAGE = 16, 0.6, 0.25
+SIDE_PX, MIN_SIMILARITY, MAX_SHARE_OF_OWN = 16, 0.6, 0.5
 """Another camera's photograph: correlation of images of this size with the other's rendering, at
-least, and by how much it is larger than with its own."""
+least, and how far it is from 1 relative to that with its own: 0.002 to 0.45, else 1 or more."""
 
 
 def look_for_bad_photographs(fit: ShortFit, among: Collection[str] | None = None) -> Finding | None:
@@ -50,7 +50,7 @@ def look_for_bad_photographs(fit: ShortFit, among: Collection[str] | None = None
 
     among: of these alone, which the fit has left out.
     """
-    found = bad_photographs(fit)
+    found = bad_photographs(fit, MAX_DEVIATIONS if among is None else CONFIRMED)
     if among is not None:
         found = {name: found[name] for name in among if name in found}
     if not found and among is not None:
@@ -72,8 +72,11 @@ def look_for_moving_things(fit: ShortFit) -> Finding:
     return Finding("things that move", text, False, {}, advice=advice if share > MANY else "")
 
 
-def bad_photographs(fit: ShortFit) -> dict[str, str]:
-    """Return the reasons by name; photographs of both groups, fitted and held out, are judged."""
+def bad_photographs(fit: ShortFit, limit: float = MAX_DEVIATIONS) -> dict[str, str]:
+    """Return the reasons by name; photographs of both groups, fitted and held out, are judged.
+
+    limit: normal deviations, beyond which they are bad.
+    """
     held_out = fit.dataset.test, fit.alignments, fit.images
     trained = fit.dataset.train[: len(fit.trained)], fit.trained, fit.trained_images
     renderings, found = {}, {}
@@ -81,7 +84,7 @@ def bad_photographs(fit: ShortFit) -> dict[str, str]:
         renderings |= {view.name: image for view, image in zip(views, images, strict=True)}
     for views, alignments, images in (held_out, trained):
         if len(views) >= MIN_VIEWS:
-            found |= _outliers(views, alignments, images, renderings)
+            found |= _outliers(views, alignments, images, renderings, limit)
     return found
 
 
@@ -90,6 +93,7 @@ def _outliers(
     alignments: Sequence[Alignment],
     images: Sequence[np.ndarray],
     renderings: dict[str, np.ndarray],
+    limit: float,
 ) -> dict[str, str]:
     worse = -_deviations([a.psnr for a in alignments], LEAST_DEVIATIONS["psnr"])
     softer = -_deviations([a.sharpness for a in alignments], LEAST_DEVIATIONS["sharpness"])
@@ -101,9 +105,9 @@ def _outliers(
         is_bright = one.gains.mean() > MIN_BRIGHTER
         if is_bright and full[index] - np.median(full) > MIN_FULL_SHARE:
             found[view.name] = f"overexposed ({full[index]:.0%} of it is white)"
-        elif worse[index] > MAX_DEVIATIONS:
+        elif worse[index] > limit:
             found[view.name] = _why_worse(view, renderings, covered[index])
-        if softer[index] > MAX_DEVIATIONS and found.get(view.name, "") in ("", ELSEWHERE):
+        if softer[index] > limit and found.get(view.name, "") in ("", ELSEWHERE):
             found[view.name] = f"blurred (steps x {np.exp(one.sharpness):.2f})"
     return {name: why for name, why in found.items() if why}
 
@@ -119,7 +123,8 @@ def _why_worse(view: View, renderings: dict[str, np.ndarray], covered: float) ->
     photograph = _thumbnail(np.asarray(view.image))
     alike = {name: float(np.mean(photograph * _thumbnail(r))) for name, r in renderings.items()}
     best = max(alike, key=alike.__getitem__)
-    if alike[best] > max(MIN_SIMILARITY, alike[view.name] + MIN_ADVANTAGE):
+    least = 1 - MAX_SHARE_OF_OWN * (1 - alike[view.name])
+    if alike[best] > max(MIN_SIMILARITY, least):
         return f"swapped (resembles the view of {best})"
     if alike[view.name] <= MIN_SIMILARITY:
         return ELSEWHERE

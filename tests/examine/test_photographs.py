@@ -112,3 +112,26 @@ def test_many_bad_photographs_are_no_single_ones(clean):
     finding = look_for_bad_photographs(judged(views, images))
     assert len(finding.changes["data.leave_out"]) == 5 and not finding.is_likely
     assert "1 more" in finding.evidence
+
+
+def test_swapped_photographs_are_found_where_all_look_alike(clean):
+    ramp = np.linspace(0, 1, clean[1][0].shape[1])[None, :, None]
+    views = [replace(v, image=(0.35 * v.image + 0.6 * ramp).astype(np.float32)) for v in clean[0]]
+    images = [0.35 * image + 0.6 * ramp for image in clean[1]]
+    swapped(views, 3)
+    found = bad_photographs(judged(views, images))
+    assert found.keys() == {views[3].name, views[12].name}
+    assert all(why.startswith("swapped") for why in found.values()), found
+
+
+def test_a_fit_without_bad_photographs_confirms_them_by_less(clean):
+    """Photographs that were left out differ more from one another than those of the first fit."""
+    views, images = [*clean[0]], [*clean[1]]
+    rng = np.random.default_rng(2)
+    noise = iter(np.geomspace(0.005, 0.03, len(images)))
+    images = [image + rng.normal(0, next(noise), image.shape) for image in images]
+    covered(views, 3)
+    fit = judged(views, images)
+    assert bad_photographs(fit) == {}
+    finding = look_for_bad_photographs(fit, among=[views[3].name])
+    assert finding is not None and finding.changes["data.leave_out"] == [views[3].name]
