@@ -53,6 +53,9 @@ SMOOTH = {"alpha_cut": 0.0, "transmittance_stop": 0.0}
 TRANSPOSE_TOLERANCE = 1e-11
 """Relative to the sum of absolute values, of thousands of terms that are accurate to 1e-12."""
 
+NUM_POINTS, MAX_RAY_ERROR = 1000, 1e-9
+"""Points around the camera, of laws of lenses, and the largest error of a ray's direction."""
+
 MAX_MARKED_SHARE = 0.02  # of pixels near a threshold, which are not compared
 
 
@@ -340,7 +343,59 @@ def single_precision_is_accurate(case: Case) -> None:
         assert error <= case.single_tolerance, f"{case.name}: {name} is off by {error:.1e}"
 
 
+def jacobian_equals_differences(case: Case) -> None:
+    """The derivatives of places on the film are differences of ``project_point``."""
+    camera, points = _shown_points(case)
+    rows = camera.lens.projection_jacobian(camera, points)
+    step = case.step * dr.norm(points)
+    differences, error = [], np.zeros(1)
+    for axis, world in enumerate(camera.rotation):
+        moved = type(points)(*(step if k == axis else 0 for k in range(3)))
+        ends = [camera.lens.project_point(camera, points + sign * moved) for sign in (-1, 1)]
+        found = np.array(camera.lens.offset(camera, *ends) / (2 * step))
+        differences.append(found)
+        error = np.maximum(error, np.abs(found - [np.array(dr.dot(row, world)) for row in rows]))
+    worst = (error.max(0) / np.abs(differences).max((0, 1))).max()
+    assert worst <= case.gradient_tolerance, (
+        f"{case.name}: projection_jacobian is off by {worst:.1e}"
+    )
+
+
+def rays_meet_their_points(case: Case) -> None:
+    """The ray through a point's place on the film meets the point, and the lens shows its rays."""
+    camera, points = _shown_points(case)
+    lens = camera.lens
+    place = lens.project_point(camera, points)
+    direction = dr.normalize(lens.ray(camera, place.x, place.y))
+    way = points - lens.origin(camera, place.x, place.y)
+    worst = np.max(np.array(dr.norm(way / dr.norm(way) - direction)))
+    assert worst <= MAX_RAY_ERROR, (
+        f"{case.name}: ray misses points by {worst:.1e} of their distance"
+    )
+    y, x = np.mgrid[: case.height, : case.width].reshape(2, -1) + 0.5
+    place = llvm.Array2f64(x, y)
+    ray = lens.ray(camera, place.x, place.y)
+    meets = dr.norm(lens.place_of_ray(camera, lens.origin(camera, *place), ray) - place) < 1e-6
+    shown, _, _ = lens.visibility(replace(camera, near=llvm.Float64(0)), ray)
+    assert dr.all(~meets | shown), f"{case.name}: shows is false for rays of the film"
+
+
+def _shown_points(case: Case) -> tuple[Camera, Any]:
+    """Return the camera, and points (camera axes) that it shows on its film."""
+    rng, camera = np.random.default_rng(4), case.camera()
+    spread = np.geomspace(0.03, 3, NUM_POINTS)
+    points = llvm.Array3f64(rng.normal(size=(3, NUM_POINTS)) * spread + [[0.0], [0.0], [1.0]])
+    place = camera.lens.project_point(camera, points)
+    on_film = dr.all((place > camera.film_start) & (place < camera.film_end))
+    seen, _, _ = camera.lens.visibility(camera, points)
+    (kept,) = np.nonzero(np.array(seen & on_film))
+    assert len(kept), f"{case.name}: shows no point on the film"
+    return camera, dr.gather(llvm.Array3f64, points, llvm.UInt32(kept))
+
+
 LAWS = (
+    jacobian_equals_differences,
+    rays_meet_their_points,
     image_equals_reference,
     gradients_equal_differences,
     camera_gradients_equal_differences,

@@ -36,6 +36,7 @@ from drgs.cameras.camera import Aperture, Camera
 from drgs.cameras.fisheye import Fisheye
 from drgs.cameras.lens import LENSES
 from drgs.cameras.motion import MotionBlur, RollingShutter
+from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.config.approximations import FALLOFFS, ORDERS, PROJECTIONS, Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.reference import splatting as reference
@@ -48,7 +49,9 @@ from drgs.testing import (
     camera_gradients_equal_differences,
     gradients_equal_differences,
     image_equals_reference,
+    jacobian_equals_differences,
     laws_of,
+    rays_meet_their_points,
     single,
     single_precision_is_accurate,
 )
@@ -280,6 +283,7 @@ of_rays = LensRayFalloff.derivatives
 moments, runs = GaussianFalloff.moments, itertools.count()
 numbers, variance, cameras = Camera.numbers, Aperture.variance, MotionBlur.cameras
 seen_at, camera_of = Fisheye.project_point, RollingShutter.camera_of
+jacobian, ray, shows = ThinPrismFisheye.projection_jacobian, Fisheye.ray, Fisheye.shows
 
 BROKEN = {
     "no low-pass": (
@@ -318,6 +322,19 @@ BROKEN = {
             "with_camera_tangents",
         ),
         lambda falloff, tangents: falloff,
+    ),
+    # Lenses
+    "a Jacobian of 1.001": (
+        *("no effect, thin prism", jacobian_equals_differences, ThinPrismFisheye),
+        *("projection_jacobian", lambda *a: [1.001 * row for row in jacobian(*a)]),
+    ),
+    "rays a thousandth of a pixel off": (
+        *("no effect, fisheye", rays_meet_their_points, Fisheye, "ray"),
+        lambda lens, camera, x, y: ray(lens, camera, x + 1e-3, y),
+    ),
+    "a lens that shows too little": (
+        *("no effect, fisheye", rays_meet_their_points, Fisheye, "shows"),
+        lambda lens, position: shows(lens, position) & (position.x < position.z),
     ),
     # Features
     "an aperture one percent too large": (
