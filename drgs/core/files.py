@@ -10,9 +10,10 @@ import json
 import os
 import re
 import stat
+import threading
 import zipfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
@@ -141,8 +142,8 @@ def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
             raise ValueError(error) from None
 
 
-_TEMPORARY_NAME = re.compile(r"\.(.*)\.(\d{1,9})\.tmp(\.[^.]*)?")
-"""Names that :func:`atomic_path` makes: .STEM.PROCESS.tmp.SUFFIX."""
+_TEMPORARY_NAME = re.compile(r"\.(.*)\.(\d{1,9})(?:-\d+)?\.tmp(\.[^.]*)?")
+"""Names that :func:`atomic_path` makes: .STEM.PROCESS-THREAD.tmp.SUFFIX."""
 
 
 @contextmanager
@@ -155,7 +156,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     # The suffix stays last: image writers choose the format by it.
-    temporary = path.with_name(f".{shorten_stem(path.stem)}.{os.getpid()}.tmp{path.suffix}")
+    writer = f"{os.getpid()}-{threading.get_ident()}"
+    temporary = path.with_name(f".{shorten_stem(path.stem)}.{writer}.tmp{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -165,6 +167,20 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def write_together(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files that are one result, read by its ``.json``: a stop leaves the earlier, or none.
+
+    files: contents by path in the folder. All are complete before the first one gets its name, the
+    earlier ``.json`` are removed before that, and new ones come last.
+    """
+    indices = [name for name in files if name.endswith(".json")]
+    with ExitStack() as renames:  # in reverse order
+        for name in dict.fromkeys([*reversed(indices), *files]):
+            renames.enter_context(atomic_path(folder / name)).write_bytes(files[name])
+        for name in indices if len(files) > 1 else ():
+            (folder / name).unlink(missing_ok=True)
 
 
 def write_json(path: Path, content: object, indent: int = 1) -> None:

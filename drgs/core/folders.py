@@ -12,13 +12,13 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
 from drgs.core.errors import UserError, format_names
-from drgs.core.files import atomic_path, open_regular, read_text, remove_temporaries_of
+from drgs.core.files import open_regular, read_text, remove_temporaries_of, write_json
 
 MAX_BYTES = 1 << 26  # of a record: 200 bytes for each of a third of a million files
 
@@ -78,20 +78,18 @@ class FolderRecord:
         for folder in {self.folder / Path(name).parent for name in names} | {self.folder}:
             here = [Path(name).name for name in names if self.folder / Path(name).parent == folder]
             remove_temporaries_of(folder, [*here, self.path.name])
-        known = self._content.files if self.exists else dict.fromkeys(earlier)
-        claimed = {**known, **dict.fromkeys(names)}
-        self._write(_Content(files=claimed, paths={**self.paths, **(paths or {})}))
+        claimed = {**({} if self.exists else dict.fromkeys(earlier)), **dict.fromkeys(names)}
+        self._update(claimed, paths or {})
 
-    def seal(self) -> None:
-        """Record the digests of the files, once all of them are written."""
-        if not self.exists:
-            return
-        there = [name for name in self._content.files if (self.folder / name).is_file()]
-        files: dict[str, str | None] = {
-            name: self._content.files[name] or digest(self.folder / name) for name in there
-        }
-        if files != self._content.files:
-            self._write(_Content(files=files, paths=dict(self.paths)))
+    def seal(self, names: Iterable[str] | None = None) -> None:
+        """Record the digests of the files, once they are written.
+
+        names: of files that :meth:`claim` has named; None: all that are in the record.
+        """
+        known = self._content.files if names is None else dict.fromkeys(names)
+        files = {name: known[name] or self._compute_digest(name) for name in known}
+        if self.exists and files != self._content.files:
+            self._update(files, {})
 
     def remove(self) -> None:
         """Remove the record."""
@@ -110,11 +108,18 @@ class FolderRecord:
         known = self._content.files[name]
         return known is not None and known != digest(path)
 
-    def _write(self, content: _Content) -> None:
-        with atomic_path(self.path) as temporary:
-            temporary.write_text(
-                json.dumps(content.model_dump(), indent=1) + "\n", encoding="utf-8"
-            )
+    def _compute_digest(self, name: str) -> str:
+        """Return a file's digest; empty if there is none."""
+        path = self.folder / name
+        return digest(path) if path.is_file() else ""
+
+    def _update(self, files: Mapping[str, str | None], paths: Mapping[str, str]) -> None:
+        """Add to the record as it is now, and remove the files that have an empty digest."""
+        with _locked(self.path):
+            now = _read(self.path) if os.path.lexists(self.path) else _Content()
+            kept = {name: known for name, known in {**now.files, **files}.items() if known != ""}
+            content = _Content(files=kept, paths={**now.paths, **paths})
+            write_json(self.path, content.model_dump())
         self.exists, self._content = True, content
 
 
@@ -127,9 +132,34 @@ def digest(path: Path) -> str:
     return sha256.hexdigest()
 
 
+@contextmanager
+def _locked(record: Path) -> Iterator[None]:
+    """Keep other commands from writing a record within the block, if the system has locks.
+
+    Each replaces the file: the lock of one that has been replaced is no longer the record's.
+    """
+    with ExitStack() as opened:
+        with suppress(OSError, ImportError):  # where it cannot be written, the block says so
+            import fcntl
+
+            record.parent.mkdir(parents=True, exist_ok=True)
+            is_locked = False
+            while not is_locked:
+                file = opened.enter_context(record.open("ab"))
+                fcntl.flock(file, fcntl.LOCK_EX)
+                is_locked = os.path.samestat(os.fstat(file.fileno()), record.stat())
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                if not record.stat().st_size:  # made here, and not written
+                    record.unlink()
+
+
 def _read(path: Path) -> _Content:
     try:
-        return _Content.model_validate(json.loads(read_text(path, "record", MAX_BYTES)))
+        text = read_text(path, "record", MAX_BYTES)
+        return _Content.model_validate(json.loads(text or "{}"))  # empty: being written
     except UserError:
         raise
     except (ValueError, RecursionError):

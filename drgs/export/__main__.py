@@ -21,7 +21,7 @@ from drgs.config.approximations import DECLARED, Approximations
 from drgs.core.constants import LOW_PASS
 from drgs.core.environment import require_module
 from drgs.core.errors import UserError, did_you_mean, one_line
-from drgs.core.files import atomic_path
+from drgs.core.files import write_together
 from drgs.core.folders import FolderRecord
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.export.cleaning import add_cleaning_arguments, clean, reduce_to
@@ -200,11 +200,10 @@ def run(args: argparse.Namespace) -> None:
         files = sog.unpack(content) if _is_named(out, sog.META) else {out.name: content}
     if source.path.resolve() in {(out.parent / path).resolve() for path in files}:
         raise UserError(f"--out {out}: would replace {source.path}, the input; choose another name")
-    FolderRecord(out.parent, COMMAND).claim(files)
-    for path, content in files.items():
-        with atomic_path(out.parent / path) as temporary:
-            temporary.write_bytes(content)
-    FolderRecord(out.parent, COMMAND).seal()
+    record = FolderRecord(out.parent, COMMAND)
+    record.claim(files)
+    write_together(out.parent, files)
+    record.seal(files)
     print(f"written: {out} ({sum(map(len, files.values())) / 1e6:.1f} MB)")
 
 

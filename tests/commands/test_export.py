@@ -3,9 +3,11 @@
 import base64
 import gzip
 import json
+import os
 import sys
 import zipfile
 from dataclasses import replace
+from functools import partial
 
 import mitsuba as mi
 import numpy as np
@@ -433,3 +435,40 @@ def test_mesh_is_where_the_gaussians_are(fit, tmp_path, monkeypatch):
         assert len(points) > 1000 and share > 0.9, (name, share)
     np.testing.assert_array_equal(found["a.ply"].shape, found["a.glb"].shape)
     np.testing.assert_allclose(found["a.ply"], found["a.glb"], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["meta.json", "lod-meta.json"])
+def test_a_stop_at_any_file_leaves_one_model_or_none(tmp_path, monkeypatch, kind):
+    """An earlier export is there until all of the new one is on the disk."""
+    monkeypatch.setattr(export, "reduce_to", lambda source, count, axis: source)
+    for seed, name in enumerate("ab"):
+        gaussians_within_ranges(60, degree=0, seed=seed).save(tmp_path / f"{name}.ply")
+    out, levels = tmp_path / "web" / kind, ["--levels", "2"] if kind.startswith("lod") else []
+    index = out.parent / ("0_0/meta.json" if levels else kind)
+    means = {}
+    for name in "ab":
+        run(tmp_path / f"{name}.ply", "--out", out, *levels)
+        means[name] = Gaussians.load(index).means.tobytes()
+    seen, found, names = 0, set(), ("replace", "unlink", "open")
+    real = {name: getattr(os, name) for name in names}
+    for stop in range(100):
+        run(tmp_path / "b.ply", "--out", out, *levels)
+        left = iter(range(stop))
+
+        def stopped(*args, name, left=left, **options):
+            if str(tmp_path / "web") in str(args[0]) and next(left, None) is None:
+                raise KeyboardInterrupt
+            return real[name](*args, **options)
+
+        with monkeypatch.context() as patched:
+            for name in names:
+                patched.setattr(os, name, partial(stopped, name=name))
+            try:
+                export.main([*map(str, (tmp_path / "a.ply", "--out", out, *levels))])
+            except (KeyboardInterrupt, SystemExit):
+                seen += 1
+            else:
+                break
+        if index.exists():
+            found.add(Gaussians.load(index).means.tobytes())
+    assert seen > 10 and found <= set(means.values()) and means["b"] in found

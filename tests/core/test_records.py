@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import pytest
@@ -64,11 +65,44 @@ def test_non_utf8_names_and_paths_are_recorded(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "7", '{"files": 7}', '{"files": {"a": 7}}', '{"b": {}}', "[" * 10_000]
+    "text", [" ", "[]", "7", '{"files": 7}', '{"files": {"a": 7}}', '{"b": {}}', "[" * 10_000]
 )
 def test_a_damaged_record_is_refused_by_name(tmp_path, text):
     record(tmp_path).path.write_text(text)
     assert "must be the record of the files that were written here" in refusal(tmp_path, record)
+
+
+def test_writers_of_one_folder_keep_each_others_files(tmp_path):
+    """In threads, and within the time in which one computes its digests."""
+
+    def write_one(name):
+        one = record(tmp_path / "new")
+        one.claim([name])
+        write(tmp_path / "new", **{name: name})
+        one.seal([name])
+
+    names = [f"file{k}" for k in range(16)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write_one, names))
+    known = json.loads(record(tmp_path / "new").path.read_text())["files"]
+    assert known == {name: digest(tmp_path / "new" / name) for name in names}
+
+
+def test_a_record_is_not_sealed_for_others(tmp_path):
+    """A file that another command is about to replace would be foreign to it afterwards."""
+    first = record(tmp_path)
+    first.claim("a")
+    record(tmp_path).claim("c")
+    write(tmp_path, a="ours", c="old")
+    first.seal("a")
+    write(tmp_path, c="new")
+    assert not record(tmp_path).foreign_files("ac")
+
+
+def test_a_record_that_was_begun_and_not_written_names_nothing(tmp_path):
+    record(tmp_path).path.touch()
+    write(tmp_path, a="theirs")
+    assert record(tmp_path).foreign_files("a") == ["a"]
 
 
 def test_removed_record_leaves_no_file(tmp_path):
@@ -85,7 +119,12 @@ def test_temporary_files_of_killed_writers_are_removed(tmp_path):
     with subprocess.Popen([sys.executable, "-c", ""]) as dead:
         pass
     dead = dead.pid
-    gone = [f".a.{dead}.tmp.png", f".metrics.{dead}.tmp.json", f".notes.{dead}.tmp"]
+    gone = [
+        f".a.{dead}.tmp.png",
+        f".a.{dead}-7.tmp.png",
+        f".metrics.{dead}.tmp.json",
+        f".notes.{dead}.tmp",
+    ]
     kept = [f".a.{os.getpid()}.tmp.png", f".b.{dead}.tmp.png", ".a.tmp.png", f".a.{dead}.tmp"]
     for name in (*gone, *kept):
         (tmp_path / name).touch()
