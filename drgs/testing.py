@@ -373,7 +373,7 @@ def rays_meet_their_points(case: Case) -> None:
         f"{case.name}: ray misses points by {worst:.1e} of their distance"
     )
     y, x = np.mgrid[: case.height, : case.width].reshape(2, -1) + 0.5
-    place = llvm.Array2f64(x, y)
+    place: Any = llvm.Array2f64(x, y)
     ray = lens.ray(camera, place.x, place.y)
     meets = dr.norm(lens.place_of_ray(camera, lens.origin(camera, *place), ray) - place) < 1e-6
     shown, _, _ = lens.visibility(replace(camera, near=llvm.Float64(0)), ray)
@@ -384,7 +384,7 @@ def _shown_points(case: Case) -> tuple[Camera, Any]:
     """Return the camera, and points (camera axes) that it shows on its film."""
     rng, camera = np.random.default_rng(4), case.camera()
     spread = np.geomspace(0.03, 3, NUM_POINTS)
-    points = llvm.Array3f64(rng.normal(size=(3, NUM_POINTS)) * spread + [[0.0], [0.0], [1.0]])
+    points: Any = llvm.Array3f64(rng.normal(size=(3, NUM_POINTS)) * spread + [[0.0], [0.0], [1.0]])
     place = camera.lens.project_point(camera, points)
     on_film = dr.all((place > camera.film_start) & (place < camera.film_end))
     seen, _, _ = camera.lens.visibility(camera, points)

@@ -11,6 +11,7 @@ from its upper left corner; lengths are in scene units. Positions are Dr.Jit arr
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from itertools import chain
@@ -68,10 +69,12 @@ class Lens:
     """Names of coefficients by field, a tuple of the first of them; none: a field is a coefficient.
     """
 
+    @abstractmethod
     def project_point(self, camera: CameraParameters, position: Array3f) -> Array2f:
         """Return the place of a point on the film, px; position: camera axes."""
         raise NotImplementedError
 
+    @abstractmethod
     def projection_jacobian(
         self, camera: CameraParameters, position: Array3f, slopes: list[Float] | None = None
     ) -> list[Array3f]:

@@ -7,6 +7,7 @@ import math
 import re
 import shlex
 import sys
+import traceback
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from importlib import import_module
@@ -25,7 +26,7 @@ from drgs.cli.ending import (
 from drgs.core.constants import MAX_INT
 from drgs.core.errors import UserError, did_you_mean, one_line
 from drgs.core.processes import end_job_on_error, process_count, root_output_only
-from drgs.core.registry import reporting_extensions
+from drgs.core.registry import ExtensionError, reporting_extensions
 
 MAX_PORT = 65535  # of TCP
 
@@ -45,6 +46,8 @@ class CommandParser(argparse.ArgumentParser):
         self._module = module
         self._subcommands: tuple[str, ...] = ()
         self._more_help: Callable[[], str] = str
+        shown = "print the traceback of an extension's error"
+        self.add_argument("--traceback", action="store_true", default=argparse.SUPPRESS, help=shown)
 
     def set_help_footer(self, text: Callable[[], str]) -> None:
         """End the help with ``text()``, called when the help is shown."""
@@ -123,7 +126,7 @@ def run_command(
         print_notes(),
     ):
         parser = CommandParser(prog=prog)
-        parser.set_defaults(is_shared=False)
+        parser.set_defaults(is_shared=False, traceback=False)
         add_arguments(parser)
         with interruptible_imports():
             args = parser.parse_args(arguments)
@@ -133,8 +136,13 @@ def run_command(
             raise UserError(
                 "mpiexec: processes can share fit and render, no other command; leave it out"
             )
-        with reporting_extensions():
-            args.run(args)
+        try:
+            with reporting_extensions():
+                args.run(args)
+        except ExtensionError as error:
+            if args.traceback:
+                traceback.print_exception(error.__cause__)
+            raise
 
 
 def bounded_int(minimum: int, maximum: int = MAX_INT) -> Callable[[str], int]:

@@ -115,7 +115,7 @@ class FolderRecord:
 
     def _update(self, files: Mapping[str, str | None], paths: Mapping[str, str]) -> None:
         """Add to the record as it is now, and remove the files that have an empty digest."""
-        with _locked(self.path):
+        with _lock_record(self.path):
             now = _read(self.path) if os.path.lexists(self.path) else _Content()
             kept = {name: known for name, known in {**now.files, **files}.items() if known != ""}
             content = _Content(files=kept, paths={**now.paths, **paths})
@@ -133,7 +133,7 @@ def digest(path: Path) -> str:
 
 
 @contextmanager
-def _locked(record: Path) -> Iterator[None]:
+def _lock_record(record: Path) -> Iterator[None]:
     """Keep other commands from writing a record within the block, if the system has locks.
 
     Each replaces the file: the lock of one that has been replaced is no longer the record's.

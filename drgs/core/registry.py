@@ -29,7 +29,7 @@ from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, e
 from importlib.util import find_spec
 from pathlib import Path
 from traceback import walk_tb
-from types import ModuleType
+from types import FrameType, ModuleType
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
 from typing_extensions import override
@@ -76,9 +76,22 @@ class Extension(Generic[T]):
         return (getattr(self.value, "__doc__", None) or self.name).strip().splitlines()[0]
 
     def error(self, cause: BaseException) -> ExtensionError:
-        """Return an error that reports another with the name of the extension."""
+        """Return an error that reports another with the name of the extension, file and line."""
         text = one_line(f"{type(cause).__name__}: {cause}")
-        return ExtensionError(f'{self.kind} "{self.name}" ({self.module}): {text}')
+        places = [
+            f"{frame.f_code.co_filename}:{line}"
+            for frame, line in walk_tb(cause.__traceback__)
+            if frame.f_globals.get("__name__") == self.module
+        ]
+        place = f", at {places[-1]}" if places else ""
+        return ExtensionError(f'{self.kind} "{self.name}" ({self.module}): {text}{place}')
+
+    def owns(self, frame: FrameType) -> bool:
+        """Return whether a function is the extension, or one of its class or object."""
+        owner = frame.f_locals.get("self", frame.f_locals.get("cls"))
+        owner = owner if isinstance(owner, type) else type(owner)
+        is_function = getattr(self.value, "__code__", None) is frame.f_code
+        return is_function or (isinstance(self.value, type) and issubclass(owner, self.value))
 
     @contextmanager
     def reporting(self) -> Iterator[None]:
@@ -116,6 +129,8 @@ class Registry(Generic[T]):
         """
 
         def decorate(value: Registered) -> Registered:
+            if missing := abstract_methods(value):
+                raise TypeError(f'{self.kind} "{name}" must define {", ".join(missing)}')
             module = getattr(value, "__module__", type(value).__module__)
             before, shipped = self._extensions.get(name), shipped_modules(self.group)
             owner = shipped.get(name) if before is None else before.module
@@ -174,6 +189,12 @@ class Registry(Generic[T]):
     def installed_extensions(self) -> list[Extension[T]]:
         """Import and return the extensions that drgs does not ship, by name."""
         return [self.get(name) for name in self.names() if name not in self.shipped_names]
+
+
+def abstract_methods(value: object) -> list[str]:
+    """Return the names of a class's methods that it must define."""
+    methods = ((name, getattr(value, name, None)) for name in dir(value))
+    return [name for name, method in methods if getattr(method, "__isabstractmethod__", False)]
 
 
 Base = TypeVar("Base")
@@ -236,13 +257,15 @@ def reporting_extensions() -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        registered = {e.module: e for r in _registries for e in r._extensions.values()}
+        known = [e for r in _registries for e in r._extensions.values() if not e.is_shipped]
         cause: BaseException | None = error
         while cause is not None:
-            for frame, _ in walk_tb(cause.__traceback__):
-                extension = registered.get(frame.f_globals.get("__name__", ""))
-                if extension is not None and not extension.is_shipped:
-                    raise extension.error(root_cause(error)) from error
+            frames = [frame for frame, _ in walk_tb(cause.__traceback__)]
+            modules = [frame.f_globals.get("__name__", "") for frame in frames]
+            of_module = [e for e in known if e.module in modules]
+            owners = [e for frame in frames for e in of_module if e.owns(frame)]
+            for extension in owners or of_module:
+                raise extension.error(root_cause(error)) from error
             cause = cause.__cause__ or cause.__context__
         raise
 

@@ -8,7 +8,7 @@ compensation" has neither constraint.) The background behind a transparent photo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -146,13 +146,6 @@ class ColorCorrection(CenteredEffect):
         """Yield the mean square by which the transform differs from the identity."""
         difference = self.matrix - as_numbers(IDENTITY)
         yield self.weight * dr.mean(dr.square(difference))
-
-    @override
-    def after_backward(
-        self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
-    ) -> None:
-        dr.set_grad(self.leaves(view), derivatives)
-        self.step(view, fit.rate_decay)
 
     def transforms(self) -> np.ndarray:
         """Return the transforms of all training views, (V, 3, 4)."""

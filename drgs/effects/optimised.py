@@ -16,7 +16,7 @@ from drgs.core.types import Float
 from drgs.effects.base import TrainingEffect, as_numbers
 
 if TYPE_CHECKING:
-    from drgs.training.views import TrainingView
+    from drgs.training.views import FitState, TrainingView
 
 
 class OptimisedEffect(TrainingEffect):
@@ -46,6 +46,14 @@ class OptimisedEffect(TrainingEffect):
         for name, optimizer in self._optimizers_of(view).items():
             optimizer.set_learning_rate({name: decay * self.rates[name]})
             optimizer.step()
+
+    @override
+    def after_backward(
+        self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
+    ) -> None:
+        """Take a step of Adam; the rates decay as those of the means."""
+        dr.set_grad(self.parameters(view), derivatives)
+        self.step(view, fit.rate_decay)
 
     def numpy(self) -> dict[str, np.ndarray]:
         """Return the numbers, (V, K) each."""

@@ -145,8 +145,7 @@ class Photometry(CenteredEffect):
         self, fit: FitState, view: TrainingView, derivatives: Mapping[str, dr.ArrayBase]
     ) -> None:
         self.attached.pop(view.index, None)
-        dr.set_grad(self.parameters(view), derivatives)
-        self.step(view, fit.rate_decay)
+        super().after_backward(fit, view, derivatives)
 
     def coefficients(self) -> dict[str, np.ndarray]:
         """Return a, b, c and p, q of all cameras, (cameras, 3) and (cameras, 2)."""

@@ -16,7 +16,7 @@ import math
 import re
 import time
 from argparse import ArgumentTypeError
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,14 +29,12 @@ from drgs.config.changes import with_changes, with_iterations
 from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, note_user
 from drgs.datasets.types import Dataset
-from drgs.effects.base import TrainingEffect
 from drgs.fit.inputs import share_inputs
 from drgs.fit.loop import Continues
 from drgs.fit.memory import room_for_targets
 from drgs.fit.report import seconds_of_results
 from drgs.gaussians.parameters import Gaussians
-from drgs.training.density.strategy import DensityStrategy
-from drgs.training.losses import Loss
+from drgs.training.contracts import NO_PARTS, GivenParts
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import Trainer
 
@@ -238,9 +236,7 @@ def rehearse(
     dataset: Dataset | None,
     gaussians: Gaussians,
     comm: Communicator | None = None,
-    density: DensityStrategy | None = None,
-    effects: Sequence[TrainingEffect] = (),
-    loss: Loss | None = None,
+    parts: GivenParts = NO_PARTS,
     seconds: float = 0.0,
 ) -> tuple[Trainer, float]:
     """Run iterations on a few of the views, for some seconds; return their trainer, and one's time.
@@ -257,9 +253,8 @@ def rehearse(
         still = {"densify.start": NEVER, "densify.stop": NEVER + 1, "densify.prune.to": None}
         config = with_changes(config, {"coarse": [], **still})
     config, dataset = share_inputs(comm, config, dataset)
-    objects = deepcopy((density, effects, loss))
     room = room_for_targets(config, dataset, gaussians.num_gaussians, comm)
-    trainer = Trainer(config, dataset, gaussians, comm, *objects, room=room)
+    trainer = Trainer(config, dataset, gaussians, comm, deepcopy(parts), room=room)
     views_per_step = config.optimizer.views_per_step
     least = math.ceil(MIN_TIMED_ITERATIONS / views_per_step)
     run_steps(trainer, max(2, math.ceil(WARM_UP_ITERATIONS / views_per_step)))

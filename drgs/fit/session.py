@@ -53,9 +53,10 @@ from drgs.initialization.start import description_of_start, gaussians_at, start_
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import format_effects
 from drgs.results.history import HistoryRow
+from drgs.training.contracts import NO_PARTS, GivenParts
 from drgs.training.density.strategy import DensityStrategy
 from drgs.training.finite_checks import NonFiniteError
-from drgs.training.losses import Loss
+from drgs.training.losses import Loss, LossTerm
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import StepReport, Trainer
 
@@ -98,9 +99,7 @@ class FitSession:
     check_ranges: Callable[[], None] = lambda: None  # called after each iteration
     on_start: Callable[[FitSession], None] = lambda session: None  # before the first iteration
     comm: Communicator = field(default_factory=Communicator)
-    strategy: DensityStrategy | None = None  # None: the configured one
-    effects: Sequence[TrainingEffect] = ()  # besides the configured ones
-    loss: Loss | None = None  # None: the configured one
+    parts: GivenParts = NO_PARTS
     examines: bool = False  # whether an examination of the dataset chooses effects
     examination: ChosenEffects | None = field(init=False, default=None)
     trainer: Trainer = field(init=False)
@@ -108,10 +107,6 @@ class FitSession:
     continues: Continues = field(init=False, default_factory=lambda: until_planned_end)
     observers: list[Observer] = field(init=False, default_factory=list)
     _fingerprint: Fingerprint | None = field(init=False, default=None)
-
-    @property
-    def _objects(self) -> tuple[DensityStrategy | None, Sequence[TrainingEffect], Loss | None]:
-        return self.strategy, self.effects, self.loss
 
     @property
     def _inputs(self) -> tuple[FitConfig, Dataset]:
@@ -176,9 +171,7 @@ class FitSession:
             plan = self._plan(gaussians, self.budget)
         self.config, self.dataset = share_inputs(comm, self.config, self.dataset)
         room = room_for_targets(self.config, self.dataset, gaussians.num_gaussians, comm)
-        self.trainer = Trainer(
-            self.config, self.dataset, gaussians, comm, *self._objects, room=room
-        )
+        self.trainer = Trainer(self.config, self.dataset, gaussians, comm, self.parts, room=room)
         self.history = History()  # starts its clock
         if comm.broadcast_numbers(checkpoint is not None):
             self._restore(checkpoint)
@@ -226,7 +219,7 @@ class FitSession:
     def _plan(self, gaussians: Gaussians, budget: Budget) -> Plan | None:
         """Plan the fit, and make the plan its configuration; None on other ranks than 0."""
         start = self.config, self.dataset, gaussians, self.comm
-        trainer, iteration_s = rehearse(*start, *self._objects, seconds=budget.rehearsal_s)
+        trainer, iteration_s = rehearse(*start, self.parts, seconds=budget.rehearsal_s)
         scene = trainer.full_scene()  # gathered from all ranks
         if scene is None:
             return None
@@ -346,6 +339,7 @@ def train(
     strategy: DensityStrategy | None = None,
     effects: Sequence[TrainingEffect] = (),
     loss: Loss | None = None,
+    terms: Sequence[LossTerm] = (),
 ) -> FitResult:
     """Fit Gaussians to photographs, in memory: the bytes that ``drgs fit`` writes to its PLY file.
 
@@ -356,23 +350,22 @@ def train(
     its :class:`drgs.training.trainer.StepReport`; the fit ends early where it returns True.
 
     strategy: changes the population, instead of ``densify.strategy``; effects: take part in the fit
-    besides those of the configuration; loss: of an image and its photograph, instead of ``loss``.
+    besides those of the configuration; loss: of an image and its photograph, instead of ``loss``;
+    terms: added to the loss, besides those of the configuration.
 
     Activates the Mitsuba variant ``llvm_ad_rgb`` where none is active. Nothing is written.
 
     Raises ``drgs.core.errors.UserError`` (a ValueError) for wrong input, naming the key and the
     remedy, and ``drgs.training.finite_checks.NonFiniteError`` if a number is not finite.
     """
-    is_folder = False
+    is_folder, parts = False, GivenParts(strategy, effects, loss, terms)
     if isinstance(config, (str, Path)):
         is_folder = Path(config).is_dir()
         config = config_for(Path(config))[0] if is_folder else load_config(config)
     elif not isinstance(config, FitConfig):
         config = config_from(config, "train(): config")
-    is_examined = is_folder and dataset is None and not (strategy or effects or loss)
-    session = FitSession(
-        config, dataset, strategy=strategy, effects=effects, loss=loss, examines=is_examined
-    )
+    is_examined = is_folder and dataset is None and not parts
+    session = FitSession(config, dataset, parts=parts, examines=is_examined)
     with reporting_extensions():
         session.prepare()
         trainer, history = session.trainer, session.history

@@ -172,7 +172,10 @@ def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) ->
     check(name, gaussians)
     kept = {k: v for k, v in rendered_with.items() if extension.value.holds(k)}
     with extension.reporting():
-        return extension.value().encode(gaussians, kept)
+        content = extension.value().encode(gaussians, kept)
+        if not isinstance(content, (bytes, bytearray, memoryview)):
+            raise TypeError(f"encode() must return bytes, got {type(content).__name__}")
+        return content
 
 
 def check(name: str, gaussians: Arrays) -> None:

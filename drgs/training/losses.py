@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 import sys
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
@@ -89,6 +90,7 @@ class Loss:
         make = cast("Callable[..., Loss]", cls)
         return make() if section is None else make(section)
 
+    @abstractmethod
     def __call__(self, image: TensorXf, target: Target) -> Float:
         """Return the loss, a ``Float`` of one value; image: (H, W, 3) tensor, display space.
 

@@ -94,15 +94,25 @@ class Population:
             result[name] = type(value)(flat, (dr.width(rows), *row_shape)) if is_tensor else flat
         return result
 
-    def edit(self, keep: UInt32, append: Mapping[str, dr.ArrayBase] | None = None) -> None:
+    def edit(
+        self,
+        keep: UInt32,
+        append: Mapping[str, dr.ArrayBase | np.ndarray] | None = None,
+    ) -> None:
         """Keep some rows of every parameter, in the order given, and append new ones.
 
-        keep: (K,) ``UInt32``. append: M new rows of every parameter by name, or None. Afterwards
+        keep: (K,) ``UInt32``, as :meth:`to_device_indices` makes it. append: M new rows of every
+        parameter by name, on the device or in numpy, or None. Afterwards
         row i is former row keep[i] for i < K, and appended row i - K from there on. Kept rows have
         their moments, bit by bit, and appended ones moments of zero; step counts and learning rates
         stay. Waits for the device once, to check ``keep``.
         """
         optimizer, total = self.optimizer, self.num_local_rows
+        if not isinstance(keep, self._index_type):
+            raise TypeError(
+                "Population.edit(): keep must be row numbers, UInt32 of the device, got "
+                f"{type(keep).__name__}; to_device_indices() uploads them"
+            )
         if dr.width(keep) > 0 and dr.max(keep)[0] >= total:
             raise ValueError(f"Population.edit(): keep must hold row numbers below {total}")
         added = self._num_appended(append)
@@ -115,7 +125,9 @@ class Population:
             elements = _elements(keep, width)
             new_rows = no_moments = None
             if append is not None and added > 0:
-                new_rows = dr.detach(append[name]).array
+                rows = append[name]
+                is_host = isinstance(rows, np.ndarray)
+                new_rows = from_host(type(value.array), rows.ravel()) if is_host else rows.array
                 no_moments = dr.zeros(type(new_rows), added * width)
 
             flat = _gather_and_append(dr.detach(value).array, elements, new_rows)
@@ -127,7 +139,7 @@ class Population:
             optimizer.state[name] = flat, promoted, rate, (step, first, second, None)
         dr.eval()
 
-    def _num_appended(self, rows: Mapping[str, dr.ArrayBase] | None) -> int:
+    def _num_appended(self, rows: Mapping[str, dr.ArrayBase | np.ndarray] | None) -> int:
         """Return the number of ``rows``, which must be given for every parameter in its shape."""
         if rows is None:
             return 0

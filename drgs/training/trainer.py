@@ -22,16 +22,25 @@ from drgs.core.adam import make_optimizer, optimizer_state, pending_gradients, r
 from drgs.core.memory import release_unused_memory
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
-from drgs.effects.base import TrainingEffect, integrator_settings, training_effects
+from drgs.effects.base import integrator_settings, training_effects
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.state import SplatsPlugin
 from drgs.splatting.rendering import NO_FAULT
+from drgs.training.contracts import (
+    NO_PARTS,
+    GivenParts,
+    checked_image,
+    checked_number,
+    checked_report,
+    checked_terms,
+    wrong_return,
+)
 from drgs.training.density.phases import density_strategy
 from drgs.training.density.strategy import DensityReport, DensityStrategy, PixelWeight, StepInfo
 from drgs.training.finite_checks import GradientWatch, WatchedIteration, check_values
-from drgs.training.losses import Loss, make_loss, make_loss_terms
+from drgs.training.losses import make_loss, make_loss_terms
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.parallel.population import (
     check_shardable,
@@ -91,25 +100,21 @@ class Trainer:
         dataset: Dataset,
         gaussians: Gaussians,
         comm: Communicator | None = None,
-        density: DensityStrategy | None = None,
-        effects: Sequence[TrainingEffect] = (),
-        loss: Loss | None = None,
+        parts: GivenParts = NO_PARTS,
         *,
         room: int = MAX_TARGET_BYTES,
     ) -> None:
         """gaussians: all, on each process; comm: None: this process alone.
 
-        density, loss: None: the configured ones; effects: besides the configured ones. room: bytes
-        of targets and uploads that may stay on the device.
+        room: bytes of targets and uploads that may stay on the device.
         """
         config = resolve_defaults(config, dataset)
         views_per_step = config.optimizer.views_per_step
         self.config, self.dataset, self.extent = config, dataset, dataset.extent
         self.comm = comm = comm or Communicator()
         check_shardable(config, comm.size, gaussians.num_gaussians)
-        self.effects = training_effects(config, dataset, effects)
-        self._given_density, self._given_effects, self._given_loss = density, effects, loss
-        self._room = room
+        self.effects = training_effects(config, dataset, parts.effects)
+        self._parts, self._room = parts, room
         self.scene = make_scene(
             local_gaussians(gaussians, comm),
             config.model,
@@ -126,8 +131,8 @@ class Trainer:
             beta_1=config.optimizer.beta_1**views_per_step,
             beta_2=config.optimizer.beta_2**views_per_step,
         )
-        self.loss = loss or make_loss(config)
-        self.terms = make_loss_terms(config)
+        self.loss = parts.loss or make_loss(config)
+        self.terms = [*make_loss_terms(config), *parts.terms]
         self.phases = make_phases(dataset.train, config, self.effects, room)
         own = own_views(len(dataset.train), views_per_step, comm.rank, comm.size)
         self.read_ahead = ReadAhead(dataset.train, own)
@@ -204,6 +209,11 @@ class Trainer:
         """Compute what the strategy sums over the pixels of each Gaussian."""
         photograph, weights = view.view.target.image, self._pixel_weights(view.iteration)
         planes = {name: weigh(image, photograph) for name, weigh in weights.items()}
+        for plane in planes.values():
+            if dr.width(plane) != image.shape[0] * image.shape[1]:
+                raise wrong_return(
+                    self.density, "pixel_weights", "planes of the image's size", plane
+                )
         self.gradients.end_view(view, planes)
 
     def _coming_views(self, step: Step, iteration: int) -> Iterator[TrainingView]:
@@ -219,9 +229,12 @@ class Trainer:
 
         def penalties(parameters: Mapping[str, dr.ArrayBase]) -> list[Float]:
             count = self.num_gaussians
-            terms = [term.of_gaussians(parameters, count) for term in self.terms]
-            terms = [term for term in terms if term is not None]
-            return [*self.density.penalties(parameters, count), *terms]
+            found = checked_terms(
+                self.density, "penalties", self.density.penalties(parameters, count)
+            )
+            for term in self.terms:
+                found += checked_terms(term, "of_gaussians", [term.of_gaussians(parameters, count)])
+            return found
 
         terms = penalties(self.parameters)
         if terms:
@@ -234,13 +247,15 @@ class Trainer:
     def compare(self, image: TensorXf, view: TrainingView) -> tuple[TensorXf, Float, Float]:
         """Return the image as a photograph of the view would be, its loss and squared error."""
         for effect in self.effects:
-            image = effect.adjust(image, view)
+            image = checked_image(effect, "adjust", effect.adjust(image, view), image)
         loss, error = self.loss.with_squared_error(image, view.target)
-        terms = [term.of_image(image, view.target) for term in self.terms]
-        terms += [penalty for effect in self.effects for penalty in effect.penalties(view)]
-        for term in terms:
-            if term is not None:
-                loss = loss + term
+        loss = checked_number(self.loss, "__call__", loss, dr.grad_enabled(image))
+        for term in self.terms:
+            for one in checked_terms(term, "of_image", [term.of_image(image, view.target)]):
+                loss = loss + one
+        for effect in self.effects:
+            for one in checked_terms(effect, "penalties", effect.penalties(view)):
+                loss = loss + one
         return image, loss, error
 
     def _pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
@@ -311,7 +326,7 @@ class Trainer:
         for iteration in filter(density.is_due, step.iterations):
             self.check()
             change = density.refine(self.population, iteration)
-            if change is not None:
+            if checked_report(density, change, self.num_gaussians) is not None:
                 report = change
                 for effect in self.effects:
                     effect.on_population_change(self.fit_state(step, iteration))
@@ -425,14 +440,12 @@ class Trainer:
         self.comm.collective(check_own)
 
     def spawn(self, config: FitConfig, gaussians: Gaussians) -> Trainer:
-        """Return a trainer with the same photographs, and copies of the given effects and loss.
+        """Return a trainer with the same photographs, and copies of the given parts.
 
         config: of another fit, which decides about its population.
         """
-        effects, loss = deepcopy((self._given_effects, self._given_loss))
-        return Trainer(
-            config, self.dataset, gaussians, self.comm, effects=effects, loss=loss, room=self._room
-        )
+        parts = replace(deepcopy(self._parts), strategy=None)
+        return Trainer(config, self.dataset, gaussians, self.comm, parts, room=self._room)
 
     def warm_start(self, former: Trainer) -> None:
         """Begin after the iterations of another trainer, with the state of its effects."""
@@ -492,7 +505,7 @@ class Trainer:
 
     def _density_from(self, state: Mapping[str, np.ndarray]) -> DensityStrategy:
         """Return the strategy of the configuration with its state; empty: at the beginning."""
-        density = density_strategy(self.config, self.dataset, self._given_density)
+        density = density_strategy(self.config, self.dataset, self._parts.strategy)
         density.begin(self.population)
         if state:
             density.restore(state)

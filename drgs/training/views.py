@@ -18,6 +18,7 @@ from drgs.datasets.types import View
 from drgs.effects.base import TrainingEffect, as_tensor
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
 from drgs.integrator.state import SplatsPlugin
+from drgs.training.contracts import checked_image
 from drgs.training.losses import Target, prepare_target
 
 
@@ -61,7 +62,7 @@ class TrainingView:
         view = self.dataset_view
         image = np.asarray(view.image)
         for effect in self._effects:
-            image = effect.target_image(view, image)
+            image = checked_image(effect, "target_image", effect.target_image(view, image), image)
         return prepare_target(as_tensor(image))
 
     def replace_photograph(self, image: TensorXf) -> None:

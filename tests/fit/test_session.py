@@ -17,6 +17,7 @@ from drgs.fit import __main__ as fit
 from drgs.fit import fit_folder
 from drgs.fit.budget import rehearse
 from drgs.fit.session import FitSession
+from drgs.training.contracts import GivenParts
 from drgs.training.density.strategy import DensityReport, DensityStrategy
 from drgs.training.losses import Loss
 
@@ -66,7 +67,7 @@ def test_objects_are_used_and_other_trainers_get_copies_of_them(tmp_path):
     """A rehearsal gets all of them; Gaussians for viewers, whose number stays, no strategy."""
     density, effect = {**VALUES["densify"], "remove_floaters": False}, Blue()
     config = load_config(write_project(tmp_path, densify=density))
-    session = FitSession(config, strategy=Halves(), effects=[effect], loss=Squares())
+    session = FitSession(config, parts=GivenParts(Halves(), [effect], Squares()))
     session.prepare()
     assert session.run() and effect.count == VALUES["iterations"]
     view = session.trainer.views[-1]
@@ -75,14 +76,13 @@ def test_objects_are_used_and_other_trainers_get_copies_of_them(tmp_path):
     expected = np.square(np.array([0, 0, 0.5]) - np.array(view.target.image)).mean()
     assert float(loss[0]) == pytest.approx(expected, rel=1e-5)
     dataset, start = session.dataset, session.trainer.gaussians()
-    objects = session.strategy, session.effects, session.loss
-    rehearsal, _ = rehearse(session.config, dataset, start, None, *objects)
+    rehearsal, _ = rehearse(session.config, dataset, start, None, session.parts)
     further = session.trainer.spawn(session.config, start)
     assert type(rehearsal.density) is Halves is not type(further.density)
     assert rehearsal.num_gaussians == start.num_gaussians // 2
     for trainer in (rehearsal, further):
         assert type(trainer.loss) is Squares and type(trainer.effects[0]) is Blue
-        assert trainer.loss is not session.loss and trainer.effects[0] is not effect
+        assert trainer.loss is not session.parts.loss and trainer.effects[0] is not effect
     assert effect.count == VALUES["iterations"] < rehearsal.effects[0].count
 
 

@@ -1,9 +1,14 @@
 """Extensions of a fit that live outside of drgs: by name in a configuration, and as objects."""
 
+import os
+import subprocess
+import sys
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from support import small_fits as fits
+from support.fit_command import write_project
 from support.installed_examples import installed_examples
 
 import drgs
@@ -127,8 +132,47 @@ def test_errors_of_an_extension_are_reported_with_its_name(examples, monkeypatch
     module = examples["vignetting"]
     exec("def adjust(self, image, view):\n    raise KeyError('oh')\n", vars(module))
     monkeypatch.setattr(module.Vignetting, "adjust", module.adjust)
-    with pytest.raises(UserError, match=r"^effect \"vignetting\" \(vignetting\): KeyError: 'oh'$"):
+    match = r"^effect \"vignetting\" \(vignetting\): KeyError: 'oh', at <string>:2$"
+    with pytest.raises(UserError, match=match):
         drgs.train(configured(), fits.plain_dataset())
+
+
+MODULE = """
+from drgs.config.extensions import STRATEGIES
+from drgs.io.formats import FORMATS, FileFormat
+from drgs.training.density.strategy import DensityStrategy
+
+@FORMATS.register("aformat")
+class AFormat(FileFormat):
+    suffix, description = ".aformat", "a format"
+
+@STRATEGIES.register("zstrategy")
+class ZStrategy(DensityStrategy):
+    def is_due(self, iteration):
+        return iteration == 2
+    def refine(self, population, iteration):
+        return population.no_such_method()
+"""
+
+
+def test_of_a_module_with_two_extensions_the_right_one_is_named(tmp_path):
+    """Also what registered later, and file and line; ``--traceback`` prints all of it."""
+    (tmp_path / "two.py").write_text(MODULE)
+    info = tmp_path / "two-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: two\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[drgs]\ntwo = two\n")
+    project = write_project(tmp_path / "project", densify={"strategy": "zstrategy"})
+    path = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+    command = [sys.executable, "-m", "drgs.fit", str(project), "--out", str(tmp_path / "out")]
+    for more in ([], ["--overwrite", "--traceback"]):
+        done = subprocess.run(
+            [*command, *more], env=os.environ | path, capture_output=True, text=True
+        )
+        expected = 'error: density strategy "zstrategy" (two): AttributeError'
+        assert done.returncode == 2 and expected in done.stderr, done.stderr
+        assert f"{tmp_path / 'two.py'}:15" in done.stderr
+        assert ("Traceback" in done.stderr) == bool(more)
 
 
 def test_summary_and_help_list_extensions():

@@ -15,6 +15,7 @@ from drgs.config.extensions import STRATEGIES, section_of
 from drgs.config.schema import FitConfig
 from drgs.core.types import Float
 from drgs.datasets.types import Dataset
+from drgs.training.contracts import checked_report
 from drgs.training.density.floaters import Floaters
 from drgs.training.density.pruning import NaturalSelection
 from drgs.training.density.strategy import (
@@ -101,6 +102,7 @@ class PhasedStrategy(DensityStrategy):
         total: DensityReport | None = None
         for phase in self.phases:
             report = phase.refine(population, iteration) if phase.is_due(iteration) else None
+            checked_report(phase, report)
             if report is not None:
                 for other in self.phases:
                     if other is not phase:

@@ -148,7 +148,9 @@ class ShardedPopulation(Population):
         return taken
 
     @override
-    def edit(self, keep: UInt32, append: Mapping[str, dr.ArrayBase] | None = None) -> None:
+    def edit(
+        self, keep: UInt32, append: Mapping[str, dr.ArrayBase | np.ndarray] | None = None
+    ) -> None:
         kept, optimizer = np.array(keep), self.optimizer
         num_appended = 0 if append is None else append["means"].shape[0]
         after = replace(self.shard, total=len(kept) + num_appended)
