@@ -19,7 +19,7 @@ from drgs.config.section import ExtensibleSection, expectation, format_value
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.files import atomic_path, read_text
 
-PATH_KEYS = ("data.path", "data.depth_from", "init.point_cloud", "output.dir")  # made absolute
+PATH_KEYS = ("data.path", "init.point_cloud", "output.dir")  # made absolute
 
 MAX_BYTES = 1 << 20  # of a file: a thousand times all values with comments
 

@@ -140,11 +140,6 @@ class DataConfig(Section):
         "them ahead; the fit has the same bytes. null: false if they take more than half of the "
         "available memory.",
     )
-    depth_from: PathField | None = Field(
-        None,
-        description="PLY file of a mesh of triangles, or of points, in the cameras' world: depth "
-        "of the training views, instead of the data's.",
-    )
 
     @property
     def background_rgb(self) -> tuple[float, float, float]:
@@ -508,10 +503,6 @@ class FitConfig(ExtensibleSection):
     @model_validator(mode="after")
     def _check_relations(self) -> FitConfig:
         init, densify, optimizer = self.init, self.densify, self.optimizer
-        if self.data_for_training.ignore_depth:
-            expected = "data.depth_from must be null without loss.depth_weight, or with "
-            depth_from = self.data.depth_from
-            _require(depth_from is None, expected + "data.ignore_depth", depth_from)
         if init.start in ("masks", "random"):
             expected = f"init.point_cloud must be null where init.start is {init.start}"
             _require(init.point_cloud is None, expected, init.point_cloud)

@@ -50,8 +50,4 @@ def load_dataset(
     if origin != WORLD:
         note = f"; far from the origin: coordinates are relative to {format_origin(origin)}"
         dataset = replace(dataset.relative_to(origin), description=dataset.description + note)
-    if source.depth_from is not None and not source.ignore_depth:
-        from drgs.datasets.surface_depths import with_depths_from
-
-        dataset = with_depths_from(source.depth_from, dataset, keeps)
     return dataset

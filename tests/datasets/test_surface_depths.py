@@ -11,11 +11,16 @@ from support.small_capture import make_dataset, reference_camera, write_dataset
 
 from drgs.cameras.viewpoints import CameraMotion
 from drgs.config.load import config_from
+from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError
+from drgs.core.registry import temporary_registrations
 from drgs.datasets import load_dataset
 from drgs.datasets.film import to_camera, to_film
-from drgs.datasets.surface_depths import with_depths_from
+from drgs.datasets.reader import READERS
 from drgs.datasets.types import all_views
+
+with temporary_registrations():
+    from examples.surface_depths import SurfaceDepths, SurfaceDepthsSection, with_depths_from
 
 LENSES = {"pinhole": PINHOLE, **LENSES}
 
@@ -141,13 +146,13 @@ CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
 REFUSED = {
     "missing": "{path}: cannot read the file: No such file or directory",
     "text": "{path}: not a valid PLY file: the header must end with end_header",
-    "quads": "data.depth_from: {path}: must be triangles, and complete: ",
-    "index": "data.depth_from: {path}: faces must name vertices 0 to 3, got 4",
-    "cut": "data.depth_from: {path}: must be triangles, and complete: ",
+    "quads": "surface_depths.surface: {path}: must be triangles, and complete: ",
+    "index": "surface_depths.surface: {path}: faces must name vertices 0 to 3, got 4",
+    "cut": "surface_depths.surface: {path}: must be triangles, and complete: ",
     "nan": "{path}: element vertex, row 0: x must be finite, got nan",
-    "few": "data.depth_from: {path}: at least 4 points, got 3",
-    "elsewhere": "data.depth_from: {path}: no training camera that stands still sees the mesh",
-    "points elsewhere": "data.depth_from: {path}: no training camera that stands still sees the po",
+    "few": "surface_depths.surface: {path}: at least 4 points, got 3",
+    "elsewhere": "surface_depths.surface: {path}: no training camera that stands still",
+    "points elsewhere": "surface_depths.surface: {path}: no training camera",
 }
 
 
@@ -168,12 +173,19 @@ def test_files_that_give_no_depth_are_refused(photographs, case):
         if case == "cut":
             path.write_bytes(path.read_bytes()[:-4])
     with pytest.raises(UserError) as refusal:
-        load_dataset(photographs / "data", depth_from=path)
+        reader = SurfaceDepths(SurfaceDepthsSection(surface=str(path)))
+        reader.load(DataConfig(path=photographs / "data"))
     assert str(refusal.value).startswith(REFUSED[case].format(path=path)), refusal.value
 
 
-@pytest.mark.parametrize("other", [{"loss": {"depth_weight": 0}}, {"data": {"ignore_depth": True}}])
-def test_depth_that_nothing_uses_is_refused(other):
-    data = {"path": "data", "depth_from": "a.ply", **other.get("data", {})}
-    with pytest.raises(UserError, match=r"data\.depth_from must be null without loss\.depth_weigh"):
-        config_from({"data": data, **{k: v for k, v in other.items() if k != "data"}}, "test")
+def test_a_configuration_names_the_surface(photographs):
+    path = write_mesh(photographs / "a.ply", soup().reshape(-1, 3), np.arange(180).reshape(-1, 3))
+    with temporary_registrations():
+        READERS.register("surface_depths", section=SurfaceDepthsSection)(SurfaceDepths)
+        values = {"data": {"path": str(photographs / "data"), "type": "surface_depths"}}
+        config = config_from({**values, "surface_depths": {"surface": str(path)}}, "test")
+        dataset = load_dataset(config.data, sections=config.sections)
+    expected = depth_from(path, *load_dataset(photographs / "data").train)
+    for view, depth in zip(dataset.train, expected, strict=True):
+        np.testing.assert_array_equal(view.depth, depth)
+    assert any(depth.any() for depth in expected)

@@ -49,8 +49,8 @@ def test_configurations_and_images_of_scenes_stay_the_same():
     removed = {**removed, "prune": ["method", "opacity", "opacity_rate"]}
     sections = {**values, "prune": values["densify"]["prune"]}
     assert all(sections[section].pop(name) for section in removed for name in removed[section])
-    newer = [loaded["data"].pop(key) for key in ("leave_out", "in_memory", "depth_from")]
-    assert [*newer, loaded["densify"].pop("remove_floaters")] == [[], None, None, True]
+    newer = [loaded["data"].pop(key) for key in ("leave_out", "in_memory")]
+    assert [*newer, loaded["densify"].pop("remove_floaters")] == [[], None, True]
     newer = [loaded["colors"].pop(f"{name}_lr") for name in ("vignetting", "response")]
     assert [*newer, loaded.pop("stop_after")] == [None] * 3
     assert values["optimizer"].pop("means_lr_aims") == values["densify"].pop("stop_aims") == []

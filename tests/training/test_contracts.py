@@ -1,4 +1,4 @@
-"""What extensions return is checked where it is taken; objects and classes are told apart."""
+"""Returns of extensions are checked where they are taken; objects and classes are told apart."""
 
 import drjit as dr
 import mitsuba as mi
@@ -104,7 +104,7 @@ def test_rows_must_be_numbers_of_the_device():
 
 
 def test_appended_rows_may_be_numpy_arrays():
-    """As ``Population.host`` returns them."""
+    """Such as ``Population.host`` returns."""
 
     def refine(self, population, iteration):
         names = population.optimizer.state

@@ -1,4 +1,7 @@
-"""Depths of training views from a mesh or a point cloud, through any lens: ``data.depth_from``.
+"""A dataset reader that adds depths of training views from a mesh or points, through any lens.
+
+In a configuration, ``data.type: surface_depths`` reads the folder as drgs would, and the section
+names the file: ``surface_depths: {surface: mesh.ply}``, in the world of the cameras.
 
 A mesh has a depth wherever the ray through a pixel's centre meets it, from either side. A point
 cloud has depths at the pixels of the points that no others hide, and none between them.
@@ -14,24 +17,47 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from pydantic import Field
 from scipy.spatial import KDTree
 
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import PINHOLE
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.cli.execution import select_variant
+from drgs.config.section import Section
 from drgs.core.environment import VARIANTS, denormals_kept
 from drgs.core.errors import UserError, reason_of_mitsuba
 from drgs.datasets.film import is_projectable, shown_points
+from drgs.datasets.folders import find_reader
 from drgs.datasets.images import unread_image
-from drgs.datasets.types import Dataset, View, ViewFilter
+from drgs.datasets.reader import READERS, DatasetReader
+from drgs.datasets.types import Dataset, View, ViewFilter, all_views
 from drgs.io.ply import read_points
 
 NUM_NEIGHBOURS = 3
 
 PIXEL_WIDTH = 4.0  # of the points' z-buffer, in their distances: with 1.5, 10 % are seen in gaps
 
-KEY = "data.depth_from"
+KEY = "surface_depths.surface"
+
+
+class SurfaceDepthsSection(Section):
+    """The section ``surface_depths``."""
+
+    surface: str = Field("", description="PLY file of a mesh of triangles, or of points.")
+
+
+@READERS.register("surface_depths", section=SurfaceDepthsSection)
+class SurfaceDepths(DatasetReader):
+    """Reads a dataset of another layout, with the depth of a surface."""
+
+    def __init__(self, section: SurfaceDepthsSection) -> None:
+        self.path = Path(section.surface).expanduser()
+
+    def load(self, config, keeps=all_views):
+        """Return the views with the depths of the surface."""
+        reader = find_reader(config.model_copy(update={"type": "auto"}), {})[1]
+        return with_depths_from(self.path, reader.load(config, keeps), keeps)
 
 
 def with_depths_from(path: Path, dataset: Dataset, keeps: ViewFilter) -> Dataset:
