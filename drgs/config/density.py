@@ -39,6 +39,7 @@ class DensifyConfig(ExtensibleSection):
     """Changes of the number of Gaussians; with a section for each strategy, under its name."""
 
     registries: ClassVar = (STRATEGIES,)
+    removed: ClassVar = {"stop_aims": []}
     scaled: ClassVar = ("start", "stop")
 
     strategy: Annotated[str, name_of(STRATEGIES)] = Field(

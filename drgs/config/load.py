@@ -13,7 +13,6 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 from typing_extensions import override
 
-from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import FitConfig
 from drgs.config.section import ExtensibleSection, expectation, format_value
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
@@ -166,9 +165,6 @@ def _parse_override(override: str) -> tuple[str, object]:
     key = key.strip()
     if not equals or not key:
         raise UserError(f"--set {override}: must be KEY=VALUE, as in densify.every=200")
-    if key.startswith("extensions."):  # the place in earlier versions
-        key = key.removeprefix("extensions.")
-        key = f"densify.{key}" if key.partition(".")[0] in STRATEGIES else key
     if _find(key) is None:
         raise UserError(f"--set {key}: unknown key {key}{did_you_mean(key, known_keys())}")
     if key in PATH_KEYS:

@@ -7,7 +7,6 @@ has those of the paper (Kerbl et al. 2023, section 7, and its released code).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -24,7 +23,6 @@ from pydantic import (
     model_validator,
 )
 from pydantic.fields import FieldInfo
-from typing_extensions import override
 
 from drgs.config.approximations import DECLARED, Approximations, Declared, Value
 from drgs.config.density import REFERENCE_START, DensifyConfig
@@ -277,7 +275,7 @@ class ModelConfig(_ModelWithApproximations):
 class OptimizerConfig(Section):
     """Adam (Kingma and Ba 2015): learning rates per step and its constants."""
 
-    removed: ClassVar = {"epsilon": 1e-15}
+    removed: ClassVar = {"epsilon": 1e-15, "means_lr_aims": []}
 
     means_lr: Rate = Field(3.2e-4, gt=0, description="Initial rate of the means, in scene extents.")
     means_lr_final: Rate = Field(
@@ -387,27 +385,11 @@ def _format_section(section: BaseModel) -> str:
     return f"{{{', '.join(f'{name}: {value}' for name, value in section)}}}"
 
 
-def _read_revised_plan(values: Mapping[Any, object]) -> Mapping[Any, object]:
-    """Read a plan that the clock of an earlier version has revised as its last one, cut."""
-    values, aims = dict(values), []
-    for name, key in (("optimizer", "means_lr_aims"), ("densify", "stop_aims")):
-        if isinstance(section := values.get(name), Mapping) and key in section:
-            values[name] = {k: v for k, v in section.items() if k != key}
-            aims.append(section[key])
-    try:
-        if aims and aims[0]:
-            last: Any = values["iterations"]
-            values |= {"iterations": max(last, aims[0][-1].get("end", 0)), "stop_after": last}
-    except (AttributeError, KeyError, TypeError):
-        got = f"means_lr_aims must be a list of after and end, got {aims[0]}"
-        raise ValueError(f"optimizer.{got}; remove it") from None
-    return values
-
-
 class FitConfig(ExtensibleSection):
     """The configuration of a fit; with sections of extensions, under their names."""
 
     registries: ClassVar = (EFFECTS, LOSSES, LOSS_TERMS, READERS)
+    removed: ClassVar = {"extensions": {}}
 
     data: DataConfig
     init: InitConfig = subsection(InitConfig)
@@ -451,25 +433,6 @@ class FitConfig(ExtensibleSection):
     def data_for_rendering(self) -> DataConfig:
         """``data``, without depth."""
         return self.data.model_copy(update={"ignore_depth": True})
-
-    @override
-    @classmethod
-    def relocate(cls, values: Mapping[Any, object]) -> Mapping[Any, object]:
-        """Move what earlier versions have elsewhere: ``extensions``, and revised plans."""
-        values = _read_revised_plan(values)
-        sections = values.get("extensions")
-        if not isinstance(sections, Mapping):
-            return values
-        values = {key: value for key, value in values.items() if key != "extensions"}
-        for name, section in sections.items():
-            place = values
-            if name in STRATEGIES and isinstance(densify := values.get("densify", {}), Mapping):
-                place = values["densify"] = dict(densify)
-            newer = place.get(name)
-            if isinstance(section, Mapping) and isinstance(newer, Mapping):
-                section = {**section, **newer}
-            place[name] = newer if section is None else section
-        return values
 
     @model_validator(mode="after")
     def _follow_from_iterations(self) -> FitConfig:

@@ -115,18 +115,13 @@ class ExtensibleSection(Section):
         for registry in cls.registries:
             yield from (e for e in registry.all() if e.section or not e.is_shipped)
 
-    @classmethod
-    def relocate(cls, values: Mapping[Any, object]) -> Mapping[Any, object]:
-        """Return given values, with the keys of earlier versions replaced."""
-        return values
-
     @model_validator(mode="wrap")
     @classmethod
     def _validate_sections(cls, values: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if not isinstance(values, Mapping):
             return handler(values)
-        values = cls.relocate(values)
-        own = {key: value for key, value in values.items() if key in cls.model_fields}
+        known = {*cls.model_fields, *cls.removed}
+        own = {key: value for key, value in values.items() if key in known}
         others = {str(key): _to_mapping(values[key]) for key in values if key not in own}
         extensions = [extension for name in others if (extension := cls.extension(name))]
         models: dict[str, Any] = {each.name: (each.section or Section, ...) for each in extensions}

@@ -157,7 +157,7 @@ WRONG_VALUES = [
     ),
     (
         "optimizer: {means_lr_aims: [9]}",
-        "optimizer.means_lr_aims must be a list of after and end, got [9]; remove it",
+        "optimizer.means_lr_aims must be [], its only value since 0.1.0 (CHANGELOG.md), got [9]",
     ),
     ("densify: {start: 900, stop: 800}", "densify.start must be < densify.stop (800), got 900"),
     (

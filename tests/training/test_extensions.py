@@ -49,18 +49,9 @@ def test_a_configuration_names_extensions_and_sets_their_sections(tmp_path):
     assert type(again.densify.sections["halving"]) is type(config.densify.sections["halving"])
 
 
-def test_sections_of_earlier_versions_are_read():
-    old = {"data": {"path": "."}, "densify": {"strategy": "halving"}}
-    old["extensions"] = {"halving": {"after": 6}, "vignetting": None}
-    config = config_from(
-        old, "x.yml", ["extensions.vignetting.lr=0.5", "extensions.halving.after=7"]
-    )
-    assert config.densify.sections["halving"].after == 7
-    assert config.sections["vignetting"].lr == 0.5 and "extensions" not in config.model_dump()
-
-
 REFUSED = [
-    ({"extensions": {"halvin": {}}}, "unknown key halvin; did you mean densify.halving?"),
+    ({"halvin": {}}, "unknown key halvin; did you mean densify.halving?"),
+    ({"extensions": {"halving": {}}}, "extensions must be {}, its only value since 0.1.0"),
     ({"densify": {"halving": {"after": 0}}}, "densify.halving.after must be >= 1, got 0"),
     ({"densify": {"halving": {"aftr": 3}}}, "unknown key densify.halving.aftr; did you mean"),
     (
