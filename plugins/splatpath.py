@@ -249,8 +249,6 @@ def _replace_grad(values: T, gradient: T) -> T:
 
 @dataclass  # not frozen: ``dr.syntax`` carries it through a loop
 class _Path:
-    """A path at a vertex."""
-
     ray: mi.Ray3f  # that leads here
     hit: mi.PreliminaryIntersection3f
     active: mi.Bool
@@ -313,8 +311,6 @@ class _Path:
 
 @dataclass(frozen=True)
 class _Step:
-    """A step of a path to its next vertex."""
-
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f
     active: mi.Bool

@@ -320,8 +320,6 @@ def _items(
 
 @dataclass(frozen=True)
 class _Crossing:
-    """The next splat of each lane."""
-
     place: UInt32  # in the lists
     entry: UInt32  # sorted
     active: Bool  # there is one

@@ -82,7 +82,6 @@ class RayColors(SplatFeatures):
         return colors + stored[self.num_coefficients :]
 
     def _sums(self, stored: list[Float], pixel: int, start: float = 0.5) -> list[Float]:
-        """Return sums of basis functions times coefficients."""
         sums = [type(stored[0])(start)] * CHANNELS
         for k, basis in enumerate(self.basis[pixel]):
             coefficients = stored[CHANNELS * k : CHANNELS * (k + 1)]

@@ -500,7 +500,6 @@ class FitConfig(ExtensibleSection):
         _require(fits, f"init.num_points must be <= {key} ({cap})", num_points)
 
     def _check_last_phase(self) -> None:
-        """Check that pruning takes place."""
         prune, n = self.densify.prune, self.iterations
         start = self.densify.prune_window(n)[0]
         expected = f"densify.prune.stop must be > densify.stop and densify.prune.start ({start})"

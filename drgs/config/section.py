@@ -147,7 +147,6 @@ def _to_mapping(section: object) -> object:
 
 
 def _error_details(error: ErrorDetails) -> InitErrorDetails:
-    """Return an error as pydantic accepts it."""
     kind = error["type"]
     if kind not in get_args(ErrorType):  # our own, or one that pydantic has in Python
         kind = PydanticCustomError(cast(LiteralString, kind), "{text}", {"text": error["msg"]})

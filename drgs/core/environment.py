@@ -92,7 +92,6 @@ def denormals_kept() -> Iterator[None]:
 
 @contextmanager
 def _mode(change: Callable[[int], int]) -> Iterator[None]:
-    """Change MXCSR within the block."""
     if (platform.libc_ver()[0], platform.machine()) != ("glibc", "x86_64"):
         yield
         return

@@ -13,7 +13,6 @@ from pydantic import BaseModel
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
 from drgs.core.origin import WORLD, choose_origin, format_origin
-from drgs.datasets.splits import leave_out
 from drgs.datasets.types import Dataset, View, ViewFilter, Viewpoint, all_views
 
 __all__ = ["Dataset", "View", "Viewpoint", "load_dataset"]
@@ -42,7 +41,7 @@ def load_dataset(
         source = config_from({"data": {**given, **settings}}, "load_dataset()").data
     from drgs.datasets.folders import find_reader  # a list of commands needs no readers
 
-    dataset = leave_out(find_reader(source, sections)[1].load(source, keeps), source)
+    dataset = find_reader(source, sections)[1].load(source, keeps)
     if not dataset.train:
         return dataset
     middle = np.mean([view.center for view in dataset.train], axis=0)

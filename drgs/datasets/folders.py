@@ -18,7 +18,8 @@ from drgs.core.errors import UserError, format_names
 from drgs.datasets.colmap import find_model, folders_in
 from drgs.datasets.files import images_in
 from drgs.datasets.images import downscaled_size
-from drgs.datasets.reader import DatasetReader
+from drgs.datasets.reader import DatasetReader, read_photograph
+from drgs.datasets.splits import ends_in
 from drgs.io.images import image_size
 
 MAX_PIXELS = 600_000
@@ -77,7 +78,9 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
     overrides, where = list(overrides), str(folder)
     given = config_from({"data": {"path": folder}}, where, overrides)
     layout, reader = find_reader(given.data, given.sections)
-    sizes = [image_size(file) for file in reader.image_files(given.data)]
+    out, files = given.data.leave_out, reader.image_files(given.data)
+    files = [file for file in files if not any(ends_in(file, name) for name in out)] or files
+    sizes = [read_photograph(image_size, file) for file in files]
     width, height = max(sizes, key=lambda size: (math.prod(size), size[1]))
     data = {"path": folder, "type": layout, "image_size": _max_width(width, height, sizes)}
     values = {"data": data, "iterations": ITERATIONS.get(layout, 4500)}

@@ -396,7 +396,6 @@ def compact_mask(mask: np.ndarray, store: MemoryStore = MEMORY) -> LazyImage:
 def _convert_lazily(
     kept: Pixels, convert: Callable[[np.ndarray], np.ndarray], store: MemoryStore
 ) -> LazyImage:
-    """Return an image that is converted at each access."""
     return LazyImage(
         kept.shape, lambda: convert(np.asarray(kept)), kept.nbytes, None, store.is_on_disk
     )

@@ -24,6 +24,7 @@ from drgs.datasets.reader import (
     load_views,
     make_dataset,
 )
+from drgs.datasets.splits import left_out
 from drgs.datasets.transforms import (
     TransformsFrame,
     focal_from_angle,
@@ -57,6 +58,8 @@ class NerfSyntheticReader(DatasetReader):
             config = config.model_copy(update={"background": "white"})
         test_split, notes, notices = _test_split(config), [], Notices(config.path)
         frames = {split: _frames(config, split, notes) for split in ("train", test_split)}
+        left = left_out(config, [frame for split in frames.values() for frame in split])
+        frames = {k: [f for f in v if f.file_path not in left] for k, v in frames.items()}
         train = _load_split(config, frames["train"], keeps, notices)
         test = train
         if test_split != "train":
@@ -101,6 +104,8 @@ def _frames(config: DataConfig, split: str, notes: list[str]) -> list[Transforms
 def _load_split(
     config: DataConfig, frames: list[TransformsFrame], keeps: ViewFilter, notices: Notices
 ) -> tuple[View, ...]:
+    if not frames:
+        return ()
     first = frames[0].files["image"]
     width, height = image_size(first)
 

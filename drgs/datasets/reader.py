@@ -40,7 +40,7 @@ from drgs.datasets.images import (
     read_mask,
     unread_image,
 )
-from drgs.datasets.splits import Lists, split_of
+from drgs.datasets.splits import Lists, left_out, split_of
 from drgs.datasets.transforms import (
     CLOSE_POSE_KEY,
     TransformsFrame,
@@ -111,15 +111,19 @@ class DatasetReader:
         frames = sorted(photographs.frames, key=lambda frame: frame.file_path)
         names = [frame.file_path for frame in frames]
         split = split_of(config, photographs.source, photographs.lists, names, photographs.notes)
+        left = left_out(config, frames)
         changes: dict[str, object] = {"image_size": config.image_size or MAX_WIDTH}
         if config.background is None:
-            is_any_transparent = any(read_header(f.files["image"]).has_alpha for f in frames)
+            opened = [f.files["image"] for f in frames if f.file_path not in left]
+            is_any_transparent = any(read_photograph(read_header, f).has_alpha for f in opened)
             changes["background"] = "white" if is_any_transparent else "black"
         config, notices = config.model_copy(update=changes), Notices(config.path)
-        used = sorted({*split.train, *split.test})
+        used = [i for i in sorted({*split.train, *split.test}) if names[i] not in left]
         views = load_views(config, [frames[i] for i in used], _intrinsics, keeps, notices)
         views = dict(zip(used, views, strict=True))
-        train, test = (tuple(views[i] for i in indices) for indices in (split.train, split.test))
+        train, test = (
+            tuple(views[i] for i in each if i in views) for each in (split.train, split.test)
+        )
         return make_dataset(config, photographs, train, test, split.name, f"({split.how})", notices)
 
     def image_files(self, config: DataConfig) -> Sequence[Path]:
@@ -137,6 +141,8 @@ def make_dataset(
     notices: Notices,
 ) -> Dataset:
     """Return a dataset of loaded views, and emit the notes on it; how: test views were chosen."""
+    if not train:
+        raise UserError(f"data.leave_out: no photograph is left to train on in {config.path}")
     notices.emit(photographs.notes, train, () if test_split == "train" else test)
     ignored, extras = describe_extras(config, photographs.frames)
     return Dataset(
@@ -149,6 +155,7 @@ def make_dataset(
             f"{config.path.name} ({photographs.layout} layout): {len(train)} train views, "
             f"measured on {len(test)} views {how}, {train[0].width}x{train[0].height}, "
             f"background {config.background}{extras}{photographs.note}"
+            + (f"; {len(config.leave_out)} left out" if config.leave_out else "")
         ),
         ignored=ignored,
         point_cloud=photographs.point_cloud,
@@ -173,7 +180,7 @@ def load_views(
 
     def load(frame: TransformsFrame, name: str) -> View:
         file, is_read = frame.files["image"], keeps(name)
-        pixels = read_pixels(file) if is_read else placeholder_pixels(file)
+        pixels = read_photograph(read_pixels if is_read else placeholder_pixels, file)
         pixels = orient_as_calibrated(pixels, frame)
         if is_read:
             notices.inspect(file, pixels)
@@ -199,6 +206,15 @@ def load_views(
         )
 
     return map_on_threads(load, frames, names, threads=num_threads(files))
+
+
+def read_photograph(read: Callable[[Path], T], file: Path) -> T:
+    """Read a photograph; an error names the remedy that always helps."""
+    try:
+        return read(file)
+    except UserError as error:
+        name = Path(*file.parts[-2:])
+        raise UserError(f"{error}; or leave it out: --leave-out {name}") from None
 
 
 def map_on_threads(

@@ -9,14 +9,14 @@ folders ``train`` and ``test`` or ``val`` that contain all photographs are the s
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.files import read_text
 from drgs.datasets.files import IMAGE_FOLDERS, MIN_FOUND_SHARE, key_of, parts_of, stem_of
-from drgs.datasets.types import Dataset, View
+from drgs.datasets.transforms import TransformsFrame, unique_names
 
 SPLITS = ("train", "val", "test")
 
@@ -186,32 +186,29 @@ def _split_every_nth(config: DataConfig, source: Path, num_views: int) -> Split:
     return Split(train, range(0, num_views, n), "test", f"every {n}th by file name")
 
 
-def leave_out(dataset: Dataset, config: DataConfig) -> Dataset:
-    """Return the dataset without the photographs of ``data.leave_out``."""
-    if not config.leave_out:
-        return dataset
-    views = (*dataset.train, *dataset.test)
+def ends_in(file: Path, name: str) -> bool:
+    """Return whether ``name`` is the end of a path, with its suffix or without."""
+    parts = Path(name).parts
+    ends = (path.parts[-len(parts) or len(path.parts) :] for path in (file, file.with_suffix("")))
+    return parts in ends
+
+
+def left_out(config: DataConfig, frames: Sequence[TransformsFrame]) -> set[str]:
+    """Return ``file_path`` of the frames that ``data.leave_out`` names: they are not opened.
+
+    A name is that of the view, or the end of the photograph's path, with its suffix or without.
+    """
+    paths, found = [frame.file_path for frame in frames], set()
+    views = unique_names(paths) if config.leave_out else []
     for name in config.leave_out:
-        if not any(_is_named(view, name) for view in views):
-            nearest = did_you_mean(name, [view.name for view in views])
+        rows = zip(paths, views, (frame.files["image"] for frame in frames), strict=True)
+        same = {path for path, view, file in rows if name == view or ends_in(file, name)}
+        if not same:
             raise UserError(
-                f"data.leave_out: {config.path} has no photograph {one_line(name, 60)}{nearest}"
+                f"data.leave_out: {config.path} has no photograph {one_line(name, 60)}"
+                f"{did_you_mean(name, views)}"
             )
-    train, test = (
-        tuple(v for v in part if not any(_is_named(v, name) for name in config.leave_out))
-        for part in (dataset.train, dataset.test)
-    )
-    if dataset.train and not train:
+        found |= same
+    if found and found.issuperset(paths):
         raise UserError(f"data.leave_out: no photograph is left to train on in {config.path}")
-    count = len(views) - len(train) - len(test)
-    description = f"{dataset.description}; {count} of these left out"
-    return replace(dataset, train=train, test=test, description=description)
-
-
-def _is_named(view: View, name: str) -> bool:
-    """Return whether a name is that of the view, or the end of its photograph's path."""
-    file, parts = view.files.get("image"), Path(name).parts
-    if file is None:
-        return name == view.name
-    count = len(parts)
-    return name == view.name or parts in (file.parts[-count:], file.with_suffix("").parts[-count:])
+    return found

@@ -322,7 +322,6 @@ def _deviation(values: Sequence[float]) -> float:
 
 
 def _set_sensor(sensor: mi.Sensor, numbers: Mapping[str, dr.ArrayBase]) -> None:
-    """Set a sensor's parameters."""
     params = mi.traverse(sensor)
     params["to_world"] = _transform(numbers["to_world"])
     for name in INTRINSICS:

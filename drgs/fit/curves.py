@@ -27,16 +27,6 @@ PAPER, INK, FAINT, RAW, LINE = "#ffffff", "#1d2330", "#e3e6ec", "#b9cdf0", "#1f5
 
 OTHERS = "#2b8a57", "#c2543a", "#8b5cb8"  # further lines of a panel
 
-DARK = {
-    PAPER: "#1a1e27",
-    INK: "#d8dde8",
-    FAINT: "#333a48",
-    RAW: "#34507f",
-    LINE: "#7fb0ff",
-    **dict(zip(OTHERS, ("#6fca98", "#f0937b", "#c3a2ea"), strict=True)),
-}
-"""The colours in the page's dark theme."""
-
 
 @dataclass(frozen=True)
 class Panel:
@@ -101,19 +91,13 @@ def write_curves(path: Path, history: FitHistory) -> None:
 
 
 def draw_curve(panel: Panel) -> str:
-    """Return an SVG of one panel, for the page; its colours follow the theme that is in use."""
+    """Return an SVG of one panel, for the page."""
     figure, text = new_figure(3.7, 2.8, paper=PAPER), io.StringIO()
     _fix_margins(figure)
     _draw(figure.subplots(), panel)
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": panel.title}):
         figure.savefig(text, format="svg", metadata={"Date": None})
-    svg, light, dark = text.getvalue(), "", ""
-    for number, color in enumerate(DARK):
-        svg = svg.replace(color, f"var(--c{number})")
-        light += f"--c{number}: {color}; "
-        dark += f"--c{number}: {DARK[color]}; "
-    themes = f":root {{ {light}}} @media (prefers-color-scheme: dark) {{ :root {{ {dark}}} }}"
-    return svg.replace("<defs>", f"<style>{themes}</style><defs>", 1)
+    return text.getvalue()
 
 
 def _fix_margins(figure: Figure) -> None:

@@ -85,7 +85,6 @@ class TrainingViewer(Observer):
         return self._scheduler.serve(lambda: self._live_scene(trainer))
 
     def _live_scene(self, trainer: Trainer) -> LiveScene:
-        """Return a scene with the Gaussians after the last iteration."""
         if self._scene is None:
             start = time.perf_counter()
             dr.sync_thread()  # the iteration's kernels may still be running

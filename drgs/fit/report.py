@@ -283,7 +283,6 @@ def _facts(dataset: Dataset, metrics: FitMetrics, history: FitHistory) -> list[t
 
 
 def _viewers(metrics: FitMetrics) -> str:
-    """Return HTML about the file for splat viewers."""
     if "viewers" not in metrics:
         return "splat viewers read it"
     shown = metrics["viewers"]
@@ -334,7 +333,6 @@ def _truth(dataset: Dataset) -> str:
 
 
 def _curve(panel: Panel) -> str:
-    """Return HTML of a curve."""
     source = _uri("image/svg+xml", draw_curve(panel).encode())
     return f'<img alt="{panel.title} over {panel.x_label}" src="{source}">'
 

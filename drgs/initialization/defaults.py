@@ -76,7 +76,6 @@ def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
 
 
 def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, object]:
-    """Return the numbers at the start and in the end that are not given."""
     changes: dict[str, object] = {}
     densify, at_start = config.densify, REFERENCE_POINTS
     if densify.has_goal:

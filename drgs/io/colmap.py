@@ -225,8 +225,6 @@ def _check_numbers(place: Place, names: Sequence[str], values: Sequence[float]) 
 
 
 class _BinaryFile:
-    """A binary file that is read from its beginning to its end."""
-
     def __init__(self, path: Path) -> None:
         self._path, self._at = path, 0
         self._data = read_bytes(path, "file", MAX_FILE_BYTES, BINARY_MEMORY_RATIO)

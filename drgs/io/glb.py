@@ -211,7 +211,6 @@ def _document(
 
 
 def _chunks(path: Path, content: bytes) -> tuple[bytes, bytes]:
-    """Return the JSON part and the binary part."""
     refused = UserError(
         f"{Place(path, 'byte', 0)}: must be a binary glTF 2.0 file of a JSON part, of at most "
         f"{MAX_JSON_BYTES:,} bytes, and a binary part; it is damaged, cut off or another file"
@@ -263,7 +262,6 @@ class _View(_Part):
 
 
 def _of_extension(key: str, **settings: Any) -> Any:
-    """Return the field of a primitive for a value of its extension."""
     return Field(validation_alias=AliasPath("extensions", EXTENSION, key), **settings)
 
 

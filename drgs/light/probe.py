@@ -195,8 +195,6 @@ NUM_TEXELS = sum(map(_num_texels, range(NUM_LEVELS)))
 
 @dataclass(frozen=True)
 class _Cube:
-    """The texels of one level of probes."""
-
     first: UInt32
     size: UInt32  # texels of an edge, without border
 

@@ -71,8 +71,6 @@ class RenderRequests:
 
 @dataclass
 class _ClientState:
-    """The last frame of a client."""
-
     shown: PendingRequest | None = None
     divisor: int = 1
     at: float = 0.0  # by time.monotonic

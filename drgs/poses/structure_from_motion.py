@@ -310,7 +310,6 @@ class _Reconstruction:
             done += len(group)
 
     def _groups(self) -> list[list[str]]:
-        """Return groups of the names of photographs that share a camera."""
         sizes = sorted({image_size(self.photographs / name) for name in self.names})
         if self.settings.share == "one" and len(sizes) > 1:
             (w, h), (other_w, other_h), *_ = sizes

@@ -291,7 +291,6 @@ def _file_names(images: Sequence[str]) -> list[str]:
 
 
 def _visible_names(folder: Path) -> list[str]:
-    """Return the names in a folder without hidden files."""
     if not os.path.lexists(folder):
         return []
     try:

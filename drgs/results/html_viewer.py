@@ -189,7 +189,6 @@ def _file_bytes(num_gaussians: int, sh_degree: int) -> int:
 def _scene(
     approximations: Approximations, view: InitialView, background: tuple[float, float, float]
 ) -> Mapping[str, object]:
-    """Return the input of the page's script."""
     camera, move = view.camera, view.to_page
     position = move.scale * move.rotation @ camera.center + move.translation
     return {

@@ -190,7 +190,6 @@ def _join_planes(tiles: CompositedTiles, parts: Sequence[list[Float]]) -> list[F
 
 
 def _select_group(group: FeatureGroup, bins: TileBins) -> TileBins:
-    """Return the bins with the features of one group."""
     model = replace(bins.model, features=group.features)
     return replace(bins, num_features=len(group.stored), model=model)
 

@@ -155,7 +155,6 @@ class Slots:
         return dr.select(occupied, self.end(entries) - begin, 0)
 
     def _first_of_sample(self, entries: Entries) -> UInt32:
-        """The first group of each lane's sample."""
         start, groups = self.samples.start, self.groups_of_sample
         start, groups = (dr.opaque(type(self.first_group), number) for number in (start, groups))
         return (entries.sample - start) * groups
@@ -180,7 +179,6 @@ def assign_slots(pairs: CompositedPairs, band: Band) -> Slots:
 
 
 def _words(pairs: CompositedPairs, band: Band, group: UInt32, micro: UInt32) -> UInt32:
-    """The composited bits of entries of the band."""
     UInt32 = type(group)
     start, stop = (dr.opaque(UInt32, n) for n in (band.entries.start, band.entries.stop))
     word = dr.gather(UInt32, pairs.words, group * MICROS + micro)

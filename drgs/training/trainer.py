@@ -176,7 +176,6 @@ class Trainer:
         return StepReport(step.last_iteration, self.num_gaussians, means_lr, report, tuple(views))
 
     def _begin_step(self) -> Step:
-        """Plan the next step."""
         before, step = self.last_step, self.plan(self.iteration + 1)
         if step.phase is not before.phase:
             before.phase.end()

@@ -53,7 +53,7 @@ def test_configuration_sets_the_reader_section(folder):
     path, views = folder
     mi.set_variant("llvm_ad_rgb")
     values = fits.config_of().model_dump() | {"data": {"path": str(path)}, "iterations": 2}
-    values |= {"init": {"num_points": 30}, "extensions": {"numpy_poses": {"unit": 2.0}}}
+    values |= {"init": {"num_points": 30}, "numpy_poses": {"unit": 2.0}}
     trainer = drgs.train(config_from(values, "x.yml")).trainer
     centers = {view.name: view.center for view in trainer.dataset.train}
     expected = {str(index): 2 * view.center for index, view in enumerate(views)}

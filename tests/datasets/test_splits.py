@@ -92,7 +92,19 @@ def test_photographs_are_left_out_by_name(photographs, name):
     dataset, _ = load_noting(photographs, leave_out=[name, "08"])
     assert sorted(names((*dataset.train, *dataset.test))) == [0, 1, 2, 4, 5, 6, 7, 9]
     assert set(names(dataset.test)) == set(names(everything.test)) - {3, 8}  # the split stays
-    assert dataset.description.endswith("; 2 of these left out")
+    assert dataset.description.endswith("; 2 left out")
+
+
+@pytest.mark.parametrize("broken", ["cut", "empty", "text"])
+def test_photographs_that_are_left_out_are_not_opened(photographs, broken):
+    file = next(photographs.rglob("03.png"))
+    content = file.read_bytes()
+    file.write_bytes({"cut": content[:-300], "empty": b"", "text": b"no image"}[broken])
+    dataset, _ = load_noting(photographs, leave_out=["03"])
+    assert sorted(names((*dataset.train, *dataset.test))) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+    found = refusal(photographs)
+    assert "03.png: cannot read the image" in found
+    assert found.endswith("; or leave it out: --leave-out images/03.png")
 
 
 @pytest.mark.parametrize(

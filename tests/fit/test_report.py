@@ -218,8 +218,6 @@ def test_page_has_no_external_references_and_its_images_are_complete(page, out, 
             curve = base64.b64decode(reference.partition(",")[2], validate=True).decode()
             texts = ElementTree.fromstring(curve).iter("{http://www.w3.org/2000/svg}text")
             assert any(text.text == "iteration" or text.text == "time [min]" for text in texts)
-            colors = set(re.findall(r"#[0-9a-f]{6}", curve))
-            assert colors == {*curves.DARK, *curves.DARK.values()}  # both themes, and no others
     assert (out / "orbit.webp").read_bytes() in contents
     assert '<input type="checkbox" id="orbit">' in page.source  # pauses it
     reduced = page.source.partition("prefers-reduced-motion: reduce")[2].partition("\n}\n")[0]

@@ -61,8 +61,6 @@ def _rays_through(objects: list[mi.Object]) -> StraightRays:
 
 @dataclass(frozen=True)
 class _Estimate:
-    """Irradiance of splats with and without objects."""
-
     scene: StraightRays
     without: StraightRays
     splats: RaySplats

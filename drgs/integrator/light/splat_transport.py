@@ -252,7 +252,6 @@ class ProbeTransport(SplatTransport):
         return self.mirrors.look(mirror, segment, active & (mirror != NO_PROBE))
 
     def _level(self, pdf: mi.Float) -> mi.UInt32:
-        """Return the level with texels of the solid angle of one path."""
         texel = 4 * math.pi / (6 * CUBE_SIZE_TEXELS**2)
         level = 0.5 * dr.log2(dr.rcp(dr.maximum(pdf * self.num_paths * texel, 1e-20)))
         return mi.UInt32(dr.clip(level + 0.5, 0, NUM_LEVELS - 1))

@@ -99,8 +99,6 @@ def _pad(layers: SurfaceLayers, count: int) -> SurfaceLayers:
 
 @dataclass(frozen=True)
 class _Tracer:
-    """Tracer of camera rays to the surfaces of a scene."""
-
     rays: StraightRays
     far: mi.Float  # depth, scene units: farther surfaces are not seen
     with_normals: bool

@@ -52,8 +52,6 @@ VIEWS_AT_ONCE = 4
 
 @dataclass(eq=False)
 class _View(SharedView):
-    """A view with the derivatives of this rank's rows."""
-
     gradients: list[SplatGradients] = field(default_factory=list)  # by time, until they are added
     means2d: Array2f = field(init=False)  # derivatives with respect to own rows' places on the film
     sums: dict[str, Float] = field(default_factory=dict)  # see DensityStrategy.pixel_weights
@@ -165,7 +163,6 @@ class SeveralViews:
         return cameras_in_time(without_effects(camera_from_sensor(state), self.integrator.ignore))
 
     def _project(self, each: _View) -> list[SplatTable]:
-        """Project the rows of this rank at each time of a view."""
         each.needs_camera = read_sensor(each.view.view.sensor, self.integrator.near).is_attached
         splats = []
         with dr.suspend_grad():
