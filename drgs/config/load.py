@@ -16,6 +16,7 @@ from typing_extensions import override
 from drgs.config.schema import FitConfig
 from drgs.config.section import ExtensibleSection, expectation, format_value
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
+from drgs.core.file_kinds import describe_file
 from drgs.core.files import atomic_path, read_text
 
 PATH_KEYS = ("data.path", "init.point_cloud", "output.dir")  # made absolute
@@ -119,6 +120,8 @@ _Loader.add_implicit_resolver(
 
 
 def _read_yaml(path: Path) -> dict:
+    if kind := describe_file(path):
+        raise UserError(f"{path}: {kind}")
     text = read_text(path, "configuration", MAX_BYTES)
     try:
         values = yaml.load(text, Loader=_Loader)
@@ -130,6 +133,8 @@ def _read_yaml(path: Path) -> dict:
         raise UserError(f"{path}: not valid YAML: {reason}") from None
     if not isinstance(values, dict):
         raise UserError(f"{path}: must hold sections such as 'data:', got {format_value(values)}")
+    if isinstance(values.get("frames"), list):
+        raise UserError(f"{path}: describes a dataset, no fit; give its folder {path.parent}")
     return values
 
 

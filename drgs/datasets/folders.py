@@ -15,6 +15,7 @@ from drgs.config.extensions import READERS, section_of
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig, FitConfig
 from drgs.core.errors import UserError, format_names
+from drgs.core.file_kinds import describe_file
 from drgs.datasets.colmap import find_model, folders_in
 from drgs.datasets.files import images_in
 from drgs.datasets.images import downscaled_size
@@ -70,6 +71,17 @@ def find_reader(
     raise UserError(f"{config.path}: {explain(config.path)}")
 
 
+OTHER_CAMERAS = {
+    "cameras.xml": "in Metashape, export the cameras for COLMAP",
+    "poses_bounds.npy": "LLFF has them in COLMAP's sparse/0, too",
+    "reconstruction.json": "run opensfm export_colmap",
+    "cameras.json": "those of 3DGS are a model's; give the folder that it was trained on",
+    "cameras.csv": "in RealityScan, export the registration for COLMAP",
+    "bundle.out": "Bundler's have no reader; its photographs do",
+}
+"""Files of other programs with cameras, and the way to cameras that are read."""
+
+
 def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, str]:
     """Return a configuration for the dataset in ``folder``, and the reasons for it, as text.
 
@@ -117,15 +129,23 @@ def explain(folder: Path) -> str:
 
 
 def explain_photographs(folder: Path) -> str:
-    """Explain how photographs in a folder, or in folders below, get cameras; "": there are none."""
+    """Explain how photographs, or videos, in a folder and below get cameras; "": there are none."""
     images = folder / "images"
     places = [p for p in (folder, *folders_in(folder), *folders_in(images)) if images_in(p)]
     if not places:
-        return ""
+        kinds = filter(None, map(describe_file, sorted(folder.iterdir())))
+        return next((f"holds a file that {kind}" for kind in kinds), "")
     first, given, move = places[0], folder, ""
     if first.parent == folder and first != images:
         given = first if len(places) == 1 else folder
         move = "" if len(places) == 1 else f"move those of one scene into {images}, and "
+    cameras = [(name, way) for name, way in OTHER_CAMERAS.items() if (folder / name).is_file()]
+    if cameras:
+        name, way = cameras[0]
+        return (
+            f"holds photographs, and {name}, whose cameras are not read: {way}; or find them anew: "
+            f"drgs poses {shlex.quote(str(given))}"
+        )
     there = format_names([str(place.relative_to(folder.parent)) for place in places])
     return (
         f"holds photographs ({there}), but no cameras: {move}find out where each was taken: "

@@ -64,6 +64,8 @@ DEPTH_IMAGE_UNIT = 1e-3
 
 MAX_NOTE_CHARACTERS = 1000
 
+MAX_STRETCH = 0.02  # of pixels of a panorama: as wide as high, in angle, but for this
+
 T = TypeVar("T")
 
 Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy of a view, px
@@ -262,6 +264,11 @@ def _intrinsics(
                 f"({frame.files['image']}), got {given:g}; scale the intrinsics or the images"
             )
     if (lens := lens_of(frame)) is not None and lens.whole_turn:
+        if abs(width - 2 * height) > max(2, MAX_STRETCH * width):
+            raise UserError(
+                f"{frame.files['image']}: a panorama of the whole sphere must be twice as wide as "
+                f"high, got {width} x {height} px; pad what was cropped, and mask it (mask_path)"
+            )
         return panorama_intrinsics(*size)
     fx = _focal(frame, "x", width)
     has_fy = values.fl_y is not None or values.camera_angle_y is not None

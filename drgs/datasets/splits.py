@@ -189,8 +189,8 @@ def _split_every_nth(config: DataConfig, source: Path, num_views: int) -> Split:
 def ends_in(file: Path, name: str) -> bool:
     """Return whether ``name`` is the end of a path, with its suffix or without."""
     parts = Path(name).parts
-    ends = (path.parts[-len(parts) or len(path.parts) :] for path in (file, file.with_suffix("")))
-    return parts in ends
+    ends = (path.parts[-len(parts) :] for path in (file, file.with_suffix("")))
+    return bool(parts) and parts in ends
 
 
 def left_out(config: DataConfig, frames: Sequence[TransformsFrame]) -> set[str]:

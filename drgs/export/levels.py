@@ -17,9 +17,7 @@ from drgs.export.merging import shapes_of
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.io import formats
 from drgs.io.quantization import morton_order
-from drgs.io.sog import META, encode_files
-
-LOD_META = "lod-meta.json"
+from drgs.io.sog import LOD_META, META, encode_files
 
 LEAF_SIZE = 1 << 13  # most Gaussians of a leaf, over all levels
 FILE_SIZE = 1 << 19  # Gaussians from which on a level continues in another file

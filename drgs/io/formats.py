@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from drgs.core.errors import UserError, one_line
+from drgs.core.file_kinds import describe_file
 from drgs.core.files import open_regular
 from drgs.core.origin import WORLD, Origin
 from drgs.core.registry import Extension, ExtensionError, Registry
@@ -149,6 +150,8 @@ def read_gaussians(
     """
     open_regular(path).close()
     named = format_to_read(path) or FORMATS.get("ply")
+    if named.name == "ply" and (kind := describe_file(Path(path))):
+        raise UserError(f"{path}: {kind}")
     last = "." + named.value.suffix.rpartition(".")[2]
     others = [each for each in _shipped_formats() if each.value.suffix.endswith(last)]
     for extension in (named, *(each for each in others if each is not named)):

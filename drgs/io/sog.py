@@ -21,6 +21,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import warnings
 import zipfile
 from collections.abc import Mapping
@@ -52,7 +53,7 @@ from drgs.io.quantization import (
 MAX_BYTES = 1 << 32  # largest file: 4.3 GB
 MAX_RATIO, MAX_SMALL = 16, 1 << 20  # of a file in an archive to its packed bytes, and bytes of any
 
-META = "meta.json"
+META, LOD_META = "meta.json", "lod-meta.json"
 LEVELS = 256
 POSITION_LEVELS = 65535
 MAX_LOG_POSITION = 80.0  # log(1 + |x|), below what float32 holds
@@ -73,15 +74,26 @@ class Sog(FileFormat):
     """PlayCanvas's SOG."""
 
     suffix = ".sog"
-    other_names = frozenset({META})
+    other_names = frozenset({META, LOD_META})
     description = "PlayCanvas's SOG, for SuperSplat and PlayCanvas"
     metadata = frozenset({"antialiased"})
 
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
-        """Return Gaussians, and whether ``antialiased``; of an archive or beside a meta.json."""
+        """Return Gaussians, and whether ``antialiased``; of an archive or beside a meta.json.
+
+        Of levels of detail, the finest is read.
+        """
+        if path.name.lower() == LOD_META:
+            return self._read_finest(path)
         where = f"{path}: {META}: "
-        meta = validate(_Meta, parse_json(_load(path, META), where), where)
+        content = parse_json(_load(path, META), where)
+        if isinstance(content, dict) and "mins" in content.get("scales", ""):
+            raise UserError(
+                f"{path}: version 2 of SOG is read, got version 1; write it again with "
+                "PlayCanvas's splat-transform, or as PLY"
+            )
+        meta = validate(_Meta, content, where)
         num, degree = meta.count, meta.shN.bands if meta.shN else 0
         require_scene_memory(path, num, (degree + 1) ** 2)
         low, high = (_pixels(path, n, num)[:, :3].astype(np.uint16) for n in meta.means.files)
@@ -106,6 +118,18 @@ class Sog(FileFormat):
         }
         is_antialiased = meta.antialias or meta.model == "antialiased"
         return arrays, {"antialiased": True} if is_antialiased else {}
+
+    def _read_finest(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+        content = parse_json(read_bytes(path, "file", MAX_BYTES), f"{path}: ")
+        names = content.get("filenames") if isinstance(content, dict) else None
+        names = names if isinstance(names, list) else []
+        finest = [n for n in map(str, names) if re.fullmatch(rf"0_\d{{1,9}}/{META}", n)]
+        if not finest:
+            raise UserError(f"{path}: filenames must list files as 0_0/{META}, got {names[:3]}")
+        parts = [self.read(path.parent / name) for name in finest]
+        with refuse_damage(f"{path}: cannot join its files"):
+            arrays = {k: np.concatenate([part[k] for part, _ in parts]) for k in parts[0][0]}
+        return arrays, parts[0][1]
 
     @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:

@@ -27,6 +27,7 @@ from scipy.sparse.csgraph import connected_components
 
 from drgs.core.environment import require_module
 from drgs.core.errors import UserError, format_names, note_user, one_line
+from drgs.core.file_kinds import describe_file
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.colmap import find_model
 from drgs.datasets.files import is_image, masks_of, without_masks
@@ -131,7 +132,8 @@ def photographs_in(folder: Path) -> tuple[Path, list[str]]:
     try:
         images = list(photographs.rglob("*") if photographs == below else photographs.iterdir())
     except OSError as error:
-        raise UserError(f"{folder}: cannot open the folder: {error.strerror or error}") from None
+        kind = describe_file(folder) or f"cannot open the folder: {error.strerror or error}"
+        raise UserError(f"{folder}: {kind}") from None
     images = without_masks([p for p in images if is_image(p.name) and p.is_file()])
     images.sort(key=_numeric_order)
     files = [path for path in images if path.suffix.lower() in SUFFIXES]

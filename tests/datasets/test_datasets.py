@@ -201,7 +201,11 @@ def test_panoramas_need_no_focal_length(photographs):
     """The whole image is a turn, whatever nerfstudio writes; and no pinhole could replace it."""
     path = photographs / "transforms.json"
     edit(path, lambda m: m.update(camera_model=PANORAMA, fl_x=None, cx=1.0))
-    for options, width, height in (({}, 8, 6), ({"image_size": 4}, 4, 3)):
+    assert "must be twice as wide as high, got 8 x 6 px" in refusal(photographs)
+    for file in photographs.rglob("*.png"):
+        iio.imwrite(file, iio.imread(file)[1:5])
+    edit(path, lambda m: m.pop("h", None))
+    for options, width, height in (({}, 8, 4), ({"image_size": 4}, 4, 2)):
         for ignored in (False, True):
             dataset = load(photographs, ignore_distortion=ignored, **options)
             view = dataset.train[0]

@@ -208,3 +208,35 @@ def test_archives_that_declare_much_more_than_they_hold_are_not_unpacked(tmp_pat
             archive.writestr(each, content)
     expected = f"cannot read {name}: at most 16 times its "
     assert refusal(tmp_path / "a.sog").startswith(expected)
+
+
+def test_of_levels_of_detail_the_finest_is_read(tmp_path):
+    """Files of a level follow one another; a list without any of level 0 is refused."""
+    whole = gaussians_within_ranges(60, degree=1)
+    names = []
+    for number, rows in enumerate((slice(0, 40), slice(40, 60))):
+        part = replace(whole, **{n: getattr(whole, n)[rows] for n in PARAMETER_NAMES})
+        folder = tmp_path / f"0_{number}"
+        folder.mkdir()
+        for name, content in sog.unpack(part.to_bytes("sog")).items():
+            (folder / name).write_bytes(content)
+        names.append(f"0_{number}/meta.json")
+    index = tmp_path / "lod-meta.json"
+    index.write_text(json.dumps({"filenames": ["1_0/meta.json", *names]}))
+    found = Gaussians.load(index)
+    expected = [Gaussians.load(tmp_path / name) for name in names]
+    assert found.num_gaussians == 60
+    for name in PARAMETER_NAMES:
+        joined = np.concatenate([getattr(part, name) for part in expected])
+        np.testing.assert_array_equal(getattr(found, name), joined)
+    for wrong in ({}, [], {"filenames": ["../0_0/meta.json", 7]}, {"filenames": 7}):
+        index.write_text(json.dumps(wrong))
+        with pytest.raises(UserError, match="filenames must list files as 0_0"):
+            Gaussians.load(index)
+
+
+def test_version_1_is_named(tmp_path):
+    content = {"means": {"shape": [8, 3]}, "scales": {"mins": [-6] * 3, "maxs": [0] * 3}}
+    (tmp_path / "meta.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match="version 2 of SOG is read, got version 1"):
+        Gaussians.load(tmp_path / "meta.json")
