@@ -1,5 +1,6 @@
 """Pages as viser serves them: what controls and cameras ask for."""
 
+import logging
 import socket
 import warnings
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ import viser
 from scipy.spatial.transform import Rotation
 from support.small_capture import FOCUS, RADIUS, make_dataset, pose_around
 from support.small_fits import make_trainer, plain_dataset
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from drgs.config.approximations import DECLARED, Approximations
@@ -177,3 +179,45 @@ def test_the_page_of_a_fit_follows_its_history(server):
     page.show_end(12)
     controls = controls_of(server)
     assert bar.value == 100 and controls["Pause"].disabled
+
+
+REQUESTS = {
+    "GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}": 200,
+    "GET / HTTP/1.1\r\nHost: localhost:81": 200,  # through a tunnel
+    "GET / HTTP/1.1\r\nHost: [::1": 400,
+    "GET / HTTP/1.1\r\nHost: a b": 400,
+    "GET / HTTP/1.1\r\nHost: evil.example": 400,
+    "GET / HTTP/1.1\r\nHost: 127.0.0.1.evil.example:{port}": 400,
+    "GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nHost: localhost": 400,
+    "GET / HTTP/1.1": 400,
+    f"GET /{'a' * 5000} HTTP/1.1\r\nHost: 127.0.0.1:{{port}}": 400,
+    "GET /../a HTTP/1.1\r\nHost: 127.0.0.1:{port}": 404,
+}
+
+
+@pytest.mark.parametrize("request_", REQUESTS, ids=lambda text: text[:60])
+def test_requests_that_no_browser_makes_are_refused(server, request_):
+    head = request_.format(port=server.get_port()) + "\r\nConnection: close\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", server.get_port()), timeout=10) as client:
+        client.sendall(head.encode())
+        answer = client.recv(1000)
+    assert answer.startswith(f"HTTP/1.1 {REQUESTS[request_]} ".encode()), answer
+
+
+def test_a_page_is_not_connected_to_under_another_name(server):
+    """By a page of another site, whose name leads to this machine."""
+    options = {"subprotocols": [f"viser-v{viser.__version__}"], "proxy": None}
+    connect(f"ws://127.0.0.1:{server.get_port()}", **options).close()
+    with pytest.raises(InvalidStatus, match="HTTP 400"):
+        connect(
+            "ws://evil.example",
+            sock=socket.create_connection(("127.0.0.1", server.get_port())),
+            **options,
+        )
+
+
+def test_lost_connections_do_not_fill_the_terminal(server, caplog):
+    """asyncio has no handler of its own: each write to a lost connection would be a line."""
+    asyncio_log = logging.getLogger("asyncio")
+    asyncio_log.warning("socket.send() raised exception.")
+    assert not caplog.records and not asyncio_log.isEnabledFor(logging.ERROR)
