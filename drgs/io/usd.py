@@ -9,7 +9,9 @@ read as well; a prim may be moved, but not turned or scaled.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import warnings
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -20,8 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from typing_extensions import override
 
+from drgs.core.child_process import run_in_child
 from drgs.core.environment import require_module
-from drgs.core.errors import UserError, note_user, one_line
+from drgs.core.errors import UserError, UserNote, format_names, note_user, one_line
 from drgs.core.files import refuse_damage
 from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD
@@ -36,6 +39,10 @@ from drgs.io.quantization import (
 PRIM = "/Gaussians"
 
 COLOR_SPACE = "srgb_rec709_scene"  # openUSD's name of sRGB's primaries and transfer function
+
+LEAST_S, BYTES_PER_S = 20.0, 1e6
+LEAST_BYTES, RATIO = 1 << 31, 32
+"""Time and memory that a file may take: of a file without content, and by its bytes."""
 
 EXTENT_STDS = 3.0  # standard deviations of a Gaussian that count for the extent
 
@@ -53,10 +60,16 @@ class Usd(FileFormat):
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
         """Return the Gaussians of the only prim of this kind, its translation, and the axis up."""
-        modules = _import_openusd("Gf", "Usd", "UsdGeom", "UsdVol")
-        require_memory(path, 2 * path.stat().st_size, "the file")
-        with refuse_damage(f"{path}: not a valid USD file"):
-            return _read_stage(path, *modules)
+        _import_openusd()
+        size = path.stat().st_size
+        require_memory(path, 2 * size, "the file")
+        limits = {"seconds": LEAST_S + size / BYTES_PER_S, "memory": LEAST_BYTES + RATIO * size}
+        try:
+            return run_in_child(_read_file, path, watch=note_user, **limits)
+        except RuntimeError as error:  # OpenUSD may crash, wait, or take all memory
+            text = str(error).partition(": ##")[0].strip()  # before the frame of a warning
+            reason = one_line(text.splitlines()[-1], 200)
+            raise UserError(f"{path}: not a valid USD file: OpenUSD ended: {reason}") from None
 
     @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
@@ -101,10 +114,28 @@ def _import_openusd(*names: str) -> list[Any]:
     return [import_module(f"pxr.{name}") for name in names]
 
 
-def _read_stage(
-    path: Path, Gf: Any, Usd: Any, UsdGeom: Any, UsdVol: Any
-) -> tuple[Arrays, Mapping[str, Scalar]]:
-    stage = Usd.Stage.Open(str(path))
+def _read_file(path: Path, report: Callable[[str], None]) -> tuple[Arrays, Mapping[str, Scalar]]:
+    """Read a file, in a process of its own; report: takes notes for the user."""
+    os.environ["PXR_WORK_THREAD_LIMIT"] = "1"  # each thread takes addresses from the limit
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always", UserNote)
+        with refuse_damage(f"{path}: not a valid USD file"):
+            result = _read_stage(path)
+    for note in notes:
+        if issubclass(note.category, UserNote):
+            report(str(note.message))
+    return result
+
+
+def _read_stage(path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
+    Gf, Sdf, Usd, UsdGeom, UsdVol = _import_openusd("Gf", "Sdf", "Usd", "UsdGeom", "UsdVol")
+    layer = Sdf.Layer.FindOrOpen(str(path))
+    if others := [*layer.GetCompositionAssetDependencies(), *layer.GetExternalAssetDependencies()]:
+        raise UserError(
+            f"{path}: refers to other files, which are not read ({format_names(others)}); join "
+            "them first: usdcat --flatten"
+        )
+    stage = Usd.Stage.Open(layer)
     prims = [p for p in stage.Traverse() if p.IsA(UsdVol.ParticleField3DGaussianSplat)]
     if len(prims) != 1:
         raise UserError(

@@ -25,6 +25,7 @@ from PIL import ExifTags, Image
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from drgs.core.child_process import ChildEndedError, run_in_child
 from drgs.core.environment import require_module
 from drgs.core.errors import UserError, format_names, note_user, one_line
 from drgs.core.file_kinds import describe_file
@@ -34,7 +35,6 @@ from drgs.datasets.files import is_image, masks_of, without_masks
 from drgs.datasets.folders import explain_photographs
 from drgs.datasets.images import read_mask
 from drgs.io.images import image_size, read_header, write_png
-from drgs.poses.child_process import ChildEndedError, run_in_child
 
 if TYPE_CHECKING:
     import pycolmap

@@ -1,5 +1,9 @@
 """USD that other programs may write: its variants, and what is refused by the prim."""
 
+import contextlib
+import os
+import time
+
 import numpy as np
 import pytest
 from support.formats import (
@@ -11,8 +15,9 @@ from support.formats import (
     turned,
 )
 
-from drgs.core.errors import UserNote
+from drgs.core.errors import UserError, UserNote
 from drgs.gaussians.parameters import Gaussians
+from drgs.io import usd
 
 pytest.importorskip("pxr.UsdVol", exc_type=ImportError)
 
@@ -121,3 +126,52 @@ def test_wrong_stages_are_refused(tmp_path, gaussians, name):
 def test_another_file_is_refused(tmp_path):
     (tmp_path / "a.usda").write_text("hello")
     assert refusal(tmp_path / "a.usda").startswith("not a valid USD file: ")
+
+
+HEAD = "#usda 1.0\n(\n    subLayers = [@{}@]\n)\n"
+HOSTILE = {
+    "nested": ("#usda 1.0\n" + 'def "a" {\n' * 100_000 + "}\n" * 100_000, "OpenUSD ended: SIGSEGV"),
+    "a pipe below": (HEAD.format("./pipe.usda"), "files, which are not read (./pipe.usda)"),
+    "a file elsewhere": (HEAD.format("/etc/hostname"), "refers to other files"),
+    "a reference": ('#usda 1.0\ndef "a" (references = @../b.usda@) {}\n', "refers to other files"),
+    "a payload": ('#usda 1.0\ndef "a" (payload = @b.usda@</a>) {}\n', "refers to other files"),
+    "clips": (
+        '#usda 1.0\ndef "a" (clips = { dictionary default = { asset[] assetPaths = [@./pipe.usda@] '
+        'asset manifestAssetPath = @./pipe.usda@ string primPath = "/a" } }) {}\n',
+        "",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_stages_are_refused_by_a_sentence(tmp_path, name):
+    content, message = HOSTILE[name]
+    os.mkfifo(tmp_path / "pipe.usda")
+    (tmp_path / "a.usda").write_text(content)
+    begun = time.monotonic()
+    assert message in refusal(tmp_path / "a.usda")
+    assert time.monotonic() - begun < 15
+
+
+def test_a_file_takes_no_more_than_its_size_allows(tmp_path, gaussians, monkeypatch):
+    gaussians.save(tmp_path / "a.usdc")
+    monkeypatch.setattr(usd, "LEAST_BYTES", 1 << 24)
+    assert refusal(tmp_path / "a.usdc").startswith("not a valid USD file: ")
+    monkeypatch.setattr(usd, "LEAST_BYTES", 1 << 31)
+    monkeypatch.setattr(usd, "LEAST_S", 0.02)
+    assert "OpenUSD ended: it took longer than 0 s" in refusal(tmp_path / "a.usdc")
+    monkeypatch.setattr(usd, "LEAST_S", 20.0)
+    assert Gaussians.load(tmp_path / "a.usdc").num_gaussians == 5
+
+
+def test_damaged_files_are_read_or_refused(tmp_path, gaussians):
+    """Bytes are changed, removed and inserted; whatever OpenUSD does then ends in a sentence."""
+    rng = np.random.default_rng(0)
+    gaussians.save(tmp_path / "whole.usdc")
+    content = (tmp_path / "whole.usdc").read_bytes()
+    for k in range(24):
+        place, other = rng.integers(len(content)), bytes(rng.integers(0, 256, 3, dtype=np.uint8))
+        kept = content[place + (0, 3, 200)[k % 3] :]
+        (tmp_path / "a.usdc").write_bytes(content[:place] + other + kept)
+        with contextlib.suppress(UserError):
+            assert np.isfinite(Gaussians.load(tmp_path / "a.usdc").means).all()

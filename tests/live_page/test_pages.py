@@ -205,7 +205,7 @@ def test_requests_that_no_browser_makes_are_refused(server, request_):
 
 
 def test_a_page_is_not_connected_to_under_another_name(server):
-    """By a page of another site, whose name leads to this machine."""
+    """A page of another site may have a name that leads to this machine."""
     options = {"subprotocols": [f"viser-v{viser.__version__}"], "proxy": None}
     connect(f"ws://127.0.0.1:{server.get_port()}", **options).close()
     with pytest.raises(InvalidStatus, match="HTTP 400"):

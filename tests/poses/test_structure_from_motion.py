@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 from support.colmap_models import write_dataset
 from support.datasets import load, look_at, views_by_name
 
+from drgs.core.child_process import ChildEndedError
 from drgs.core.errors import UserError, UserNote
 from drgs.core.folders import sole_writer
 from drgs.poses import structure_from_motion as sfm
-from drgs.poses.child_process import ChildEndedError
 from drgs.poses.structure_from_motion import (
     ALL_PAIRS,
     MODEL_FILES,

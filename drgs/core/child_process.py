@@ -13,6 +13,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import IO, TypeVar
 
+import psutil
+
 from drgs.core.errors import UserError, one_line
 
 Result = TypeVar("Result")
@@ -23,12 +25,17 @@ class ChildEndedError(RuntimeError):
 
 
 def run_in_child(
-    function: Callable[..., Result], *arguments: object, watch: Callable[..., None]
+    function: Callable[..., Result],
+    *arguments: object,
+    watch: Callable[..., None],
+    seconds: float | None = None,
+    memory: int | None = None,
 ) -> Result:
     """Return ``function(*arguments, report)``, called in a new process.
 
     function, arguments: can be pickled. watch: called here with the arguments of the child's
-    ``report``. Ctrl-C does not reach the child, which ends with this call or this process.
+    ``report``. seconds, memory (bytes): the most that the call may take, where the system has such
+    limits. Ctrl-C does not reach the child, which ends with this call or this process.
 
     Raises the child's :class:`UserError` or OSError, :class:`ChildEndedError` after a signal, and
     RuntimeError with the child's traceback for other errors.
@@ -42,9 +49,12 @@ def run_in_child(
             start_new_session=True,
         )  # fmt: skip
         assert child.stdin is not None and child.stdout is not None, "both are pipes"
+        clock = threading.Timer(seconds or 0, child.kill)
         try:
+            if seconds is not None:
+                clock.start()
             with suppress(BrokenPipeError):  # it has ended: see below
-                _send(child.stdin, (function, arguments))
+                _send(child.stdin, (function, arguments, memory))
             while True:
                 kind, content = pickle.load(child.stdout)
                 if kind == "result":
@@ -57,9 +67,13 @@ def run_in_child(
             stderr.seek(0)
             text = stderr.read().decode(errors="replace")
         finally:
+            is_late = seconds is not None and clock.finished.is_set()
+            clock.cancel()
             child.kill()
             with suppress(BrokenPipeError):
                 child.communicate()
+    if is_late:
+        raise ChildEndedError(f"it took longer than {seconds:.0f} s")
     if status < 0:
         text = text.partition("***")[0]  # where glog's stack trace begins
         name = signal.Signals(-status).name
@@ -71,7 +85,9 @@ def serve() -> None:
     """Run the call of :func:`run_in_child` in the child."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # libraries may print
-    function, arguments = pickle.load(sys.stdin.buffer)
+    function, arguments, memory = pickle.load(sys.stdin.buffer)
+    if memory is not None:
+        _limit_memory(memory)
 
     def end_with_parent() -> None:
         os.read(sys.stdin.fileno(), 1)  # until the parent, which holds the input open, ends
@@ -88,6 +104,14 @@ def serve() -> None:
         answer = "error", error
     _send(answers, answer)
     os._exit(0)  # without waiting for what the library does at its end
+
+
+def _limit_memory(memory: int) -> None:
+    with suppress(ImportError, OSError, ValueError):  # Windows; a lower limit of the user's
+        import resource
+
+        most = psutil.Process().memory_info().vms + memory
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
 def _send(stream: IO[bytes], message: object) -> None:

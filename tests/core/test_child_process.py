@@ -9,8 +9,8 @@ import psutil
 import pytest
 from support import child_functions
 
+from drgs.core.child_process import ChildEndedError, run_in_child
 from drgs.core.errors import UserError
-from drgs.poses.child_process import ChildEndedError, run_in_child
 
 
 def is_running(process):
@@ -57,7 +57,7 @@ def test_a_child_ends_with_a_parent_that_is_killed():
     program = (
         f"import sys; sys.path[:] = {sys.path!r}\n"
         "from support import child_functions\n"
-        "from drgs.poses.child_process import run_in_child\n"
+        "from drgs.core.child_process import run_in_child\n"
         "run_in_child(child_functions.wait, watch=lambda process: print(process, flush=True))\n"
     )
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as parent:
