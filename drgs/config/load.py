@@ -19,7 +19,7 @@ from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.file_kinds import describe_file
 from drgs.core.files import atomic_path, read_text
 
-PATH_KEYS = ("data.path", "init.point_cloud", "output.dir")  # made absolute
+PATH_KEYS = ("data.path", "init.point_cloud", "init.gaussians", "output.dir")  # made absolute
 
 MAX_BYTES = 1 << 20  # of a file: a thousand times all values with comments
 

@@ -180,6 +180,11 @@ class InitConfig(Section):
         "the dataset's own (ply_file_path, points3D), unless half_extent is given or masks are "
         "used.",
     )
+    gaussians: PathField | None = Field(
+        None,
+        description="File of Gaussians, in any format that is read, to go on from, as they are, in "
+        "place of points.",
+    )
     max_point_error: float | None = Field(
         None,
         ge=0,
@@ -439,7 +444,8 @@ class FitConfig(ExtensibleSection):
         """Resolve the part of the schedule that is not given, and the strategy's section."""
         model, densify, n = self.model, self.densify, self.iterations
         if _is_open(model, "sh_increase_every"):
-            every = max(1, min(LATEST_DEGREE, round(DEGREE_SHARE * n)))
+            every = 1 if self.init.gaussians else round(DEGREE_SHARE * n)
+            every = max(1, min(LATEST_DEGREE, every))
             self._complete("model", {"sh_increase_every": every})
         extension = STRATEGIES.get(densify.strategy)
         strategy = extension.value
@@ -466,6 +472,11 @@ class FitConfig(ExtensibleSection):
     @model_validator(mode="after")
     def _check_relations(self) -> FitConfig:
         init, densify, optimizer = self.init, self.densify, self.optimizer
+        if init.gaussians is not None:
+            others = {"start": "auto", "point_cloud": None, "half_extent": None}
+            for name, value in others.items():
+                expected = f"init.{name} must be {value or 'null'} with init.gaussians"
+                _require(getattr(init, name) == value, expected, getattr(init, name))
         if init.start in ("masks", "random"):
             expected = f"init.point_cloud must be null where init.start is {init.start}"
             _require(init.point_cloud is None, expected, init.point_cloud)

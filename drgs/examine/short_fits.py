@@ -134,7 +134,7 @@ def _fewer(start: Start) -> Start:
     """Return at most as many points as a short fit has Gaussians."""
     every = -(-len(start.means) // NUM_GAUSSIANS)
     colors = None if start.colors is None else start.colors[::every]
-    return replace(start, means=start.means[::every], colors=colors)
+    return replace(start, means=start.means[::every], colors=colors, gaussians=None)
 
 
 def shorten(config: FitConfig) -> FitConfig:

@@ -20,7 +20,7 @@ from drgs.results.folder import CHECKPOINT, CONFIG, write_run_config
 from drgs.results.history import DENSITY_COLUMNS, HistoryRow
 from drgs.training.trainer import DENSITY
 
-PLACE_KEYS = ("data.path", "data.source", "data.in_memory", "init.point_cloud")
+PLACE_KEYS = ("data.path", "data.source", "data.in_memory", "init.point_cloud", "init.gaussians")
 """Values that differ in a project that was moved, or on another machine; the data has a
 fingerprint."""
 

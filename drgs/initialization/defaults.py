@@ -69,7 +69,8 @@ def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
     if config.coarse is None or config.optimizer.scales_lr is None:
         is_cut_out = _is_cut_out(dataset)  # reads images, which a parallel fit has on other ranks
         if config.coarse is None:
-            changes["coarse"] = [] if is_cut_out else _coarse_stages(config, dataset)
+            starts_fine = is_cut_out or config.init.gaussians is not None
+            changes["coarse"] = [] if starts_fine else _coarse_stages(config, dataset)
         if config.optimizer.scales_lr is None:
             changes["optimizer.scales_lr"] = SCALES_LR_CUT_OUT if is_cut_out else SCALES_LR
     return with_changes(config, changes) if changes else config

@@ -14,6 +14,7 @@ from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.constants import SH_C0
 from drgs.core.environment import denormals_kept
 from drgs.core.errors import UserError
+from drgs.core.origin import WORLD
 from drgs.datasets.film import is_projectable, shown_points
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
@@ -29,6 +30,7 @@ from drgs.initialization.start_box import (
     points_in_view,
     start_box_of,
 )
+from drgs.io.formats import format_to_read
 from drgs.io.ply import read_points
 
 if TYPE_CHECKING:
@@ -42,6 +44,8 @@ NUM_NEIGHBOURS = 3
 
 MAX_COLOR_VIEWS, MIN_COLOR_VIEWS = 60, 8
 """Number of views whose images colour points: a third of them see most points."""
+
+MAX_HEADER = 1 << 12  # bytes of a PLY file, among which Gaussians' properties are
 
 MAX_COLOR_BYTES = 1 << 27  # memory for colours: of a million points, fewer views are read
 
@@ -59,6 +63,7 @@ class Start:
     means: np.ndarray  # (N, 3) world
     colors: np.ndarray | None  # (N, 3) display space 0..1; None: not known
     description: str  # for the user
+    gaussians: Gaussians | None = None  # to start from as they are
 
 
 def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
@@ -70,11 +75,15 @@ def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
 def gaussians_at(start: Start, config: FitConfig) -> Gaussians:
     """Return isotropic Gaussians at 4 points or more, numpy float32, as large as the gaps between.
 
+    Gaussians that are given are returned as they are.
+
     The standard deviation is the root mean square distance to the 3 nearest
     other points, which is that of the 3DGS reference (``distCUDA2``). The opacity is
     ``init.opacity``, the degree ``model.sh_degree``. Without colours: grey. Identity rotations; SH
     coefficients above degree 0 are zero.
     """
+    if start.gaussians is not None:
+        return start.gaussians
     num, init = len(start.means), config.init
     means = np.ascontiguousarray(start.means, np.float32)
     colors = np.full((num, 3), 0.5) if start.colors is None else start.colors
@@ -96,16 +105,19 @@ def gaussians_at(start: Start, config: FitConfig) -> Gaussians:
 def start_of(config: FitConfig, dataset: Dataset) -> Start:
     """Return the points that a fit starts from; config: with resolved defaults.
 
-    By default: ``init.point_cloud``; else uniform in [-h, h]^3 with ``init.half_extent``; else on
-    the visual hull, where nearly all images are partly transparent; else the point cloud that the
-    dataset names; else uniform in a box that follows from the layout and the cameras. Points on the
-    hull, and those of a cloud without colours, are coloured from the images. Masks that contradict
-    each other are not used, which the description mentions.
+    By default: ``init.gaussians``; else ``init.point_cloud``; else uniform in [-h, h]^3 with
+    ``init.half_extent``; else on the visual hull, where nearly all images are partly transparent;
+    else the point cloud that the dataset names; else uniform in a box that follows from the layout
+    and the cameras. Points on the hull, and those of a cloud without colours, are coloured from the
+    images. Masks that contradict each other are not used, which the description mentions.
 
     Raises :class:`UserError` for points that the cameras do not see, and for masks or a point cloud
     that ``init.start`` requires and that are not there.
     """
     init, note = config.init, ""
+    if init.gaussians is not None:
+        _check_unfiltered(init, str(init.gaussians))
+        return _given_start(config, dataset, init.gaussians)
     is_open = init.start == "auto" and init.point_cloud is None and init.half_extent is None
     if init.start == "masks" or (is_open and any(v.alpha is not None for v in dataset.train)):
         from drgs.initialization.visual_hull import are_masks, num_transparent, silhouettes_of
@@ -180,6 +192,25 @@ def _hull_start(
     return _with_colors(Start(means.astype(np.float32), None, what), dataset)
 
 
+def _given_start(config: FitConfig, dataset: Dataset, file: Path) -> Start:
+    """Return the Gaussians of a file, with the degree of the fit's harmonics."""
+    given, count = Gaussians.load(file), (config.model.sh_degree + 1) ** 2 - 1
+    moved = np.asarray(given.means, np.float64) + np.subtract(given.origin, dataset.origin)
+    means, higher = moved.astype(np.float32), given.shN[:, :count]
+    _check_cloud(file, means, config.densify.max_gaussians, dataset)
+    more = count - higher.shape[1]
+    shN = np.pad(higher, ((0, 0), (0, max(more, 0)), (0, 0)))
+    degree = f", their harmonics {'with more of zero' if more > 0 else 'cut'}"
+    note = degree if more or count < given.shN.shape[1] else ""
+    for name, value in (given.rendered_with or {}).items():
+        if getattr(config.model, name, value) != value:
+            note += f"; {name} was {value}"
+    note += "" if given.smoothing is None else "; their smoothing is not used"
+    start = replace(given, means=means, shN=shN, origin=WORLD, smoothing=None, rendered_with=None)
+    colors = np.clip(0.5 + SH_C0 * given.sh0[:, 0], 0, 1)
+    return Start(means, colors, f"the {len(means):,} Gaussians of {file}{note}", start)
+
+
 def _cloud_start(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
     means, colors, num_read = _read_cloud(config.init, cloud)
     means = (means - dataset.origin).astype(np.float32)
@@ -187,13 +218,18 @@ def _cloud_start(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
         colors = None  # all black: written by programs that found none
     _check_cloud(cloud, means, config.densify.max_gaussians, dataset)
     kept = "the" if len(means) == num_read else f"{len(means):,} of {num_read:,}"
-    start = Start(means, colors, f"{kept} points of {cloud}")
+    with cloud.open("rb") as file:
+        has_shapes = b"property float scale_0" in file.read(MAX_HEADER)
+    note = " (their scales, rotations and opacities are not used: set init.gaussians for that)"
+    start = Start(means, colors, f"{kept} points of {cloud}{note if has_shapes else ''}")
     return _with_colors(start, dataset) if colors is None else start
 
 
 def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
     """Return positions (N, 3) float64, world, colours (N, 3) float32, 0..1, and the number read."""
     if cloud.name not in COLMAP_POINT_FILES:
+        if (known := format_to_read(cloud)) is not None and known.name != "ply":
+            raise UserError(f"{cloud}: holds Gaussians, no points; set init.gaussians to it")
         positions, colors = read_points(cloud)
         return positions, colors, len(positions)
     from drgs.io.colmap import read_points3d

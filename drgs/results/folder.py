@@ -59,7 +59,7 @@ FOLDERS = (RENDERS, SIDE_BY_SIDE)  # results that are folders
 SECTIONS = {"data", "init", "model", "optimizer", "loss", "densify", "output", "iterations", "seed"}
 """Keys of every ``config.yml`` that a fit has written."""
 
-DATA_PATHS = ("data.path", "init.point_cloud")
+DATA_PATHS = ("data.path", "init.point_cloud", "init.gaussians")
 """Also recorded relative to the folder."""
 
 
@@ -319,7 +319,7 @@ def _is_unmodified(path: Path) -> bool:
 
 
 def _data_paths(config: FitConfig) -> dict[str, Path | None]:
-    values = (config.data.path, config.init.point_cloud)
+    values = (config.data.path, config.init.point_cloud, config.init.gaussians)
     return dict(zip(DATA_PATHS, values, strict=True))
 
 

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.datasets import dataset_of, edit, load, load_noting, put, view_at, write_points
+from support.formats import gaussians_within_ranges
 
 from drgs.cameras.viewpoints import focus_of, panorama
+from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig, InitConfig
 from drgs.core.constants import SH_C0
 from drgs.core.errors import UserError
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import (
     description_of_start,
@@ -266,3 +269,63 @@ def test_photographs_are_downscaled_to_the_reference_width_by_default(photograph
     edit(photographs / "transforms.json", lambda meta: meta.update(size))
     assert load(photographs).train[0].width == 1600
     assert load(photographs, image_size=10_000).train[0].width == 2000
+
+
+# Gaussians of a file
+
+
+def ring():
+    return dataset_of([view_at(c, (0, 0, 0)) for c in ((5, 0, 0), (0, 5, 0), (0, -5, 1))])
+
+
+@pytest.mark.parametrize("suffix", ["ply", "spz", "glb"])
+def test_a_fit_starts_from_the_gaussians_of_a_file_as_they_are(tmp_path, suffix):
+    path = tmp_path / f"a.{suffix}"
+    gaussians_within_ranges(40, degree=1).save(path)
+    given = Gaussians.load(path)
+    found = gaussians_of(ring(), init={"gaussians": path}, model={"sh_degree": 1})
+    for name in PARAMETER_NAMES:
+        np.testing.assert_array_equal(getattr(found, name), getattr(given, name), err_msg=name)
+    degree_3 = gaussians_of(ring(), init={"gaussians": path}, model={"sh_degree": 3}).shN
+    assert degree_3.shape == (40, 15, 3) and not degree_3[:, 3:].any()
+    np.testing.assert_array_equal(degree_3[:, :3], given.shN)
+    degree_0 = gaussians_of(ring(), init={"gaussians": path}, model={"sh_degree": 0})
+    assert degree_0.shN.shape == (40, 0, 3)
+
+
+def test_all_harmonics_and_full_images_are_used_at_once(tmp_path):
+    path = tmp_path / "a.ply"
+    replace(gaussians_within_ranges(40), rendered_with={"low_pass": 0.3}).save(path)
+    given = config(init={"gaussians": path}, iterations=4000)
+    resolved = resolve_defaults(given, ring())
+    assert resolved.model.sh_increase_every == 1 and resolved.coarse == []
+    assert config(iterations=4000).model.sh_increase_every == 100
+    start = start_of(resolved, ring())
+    assert start.description == f"the 40 Gaussians of {path}; low_pass was 0.3"
+    smaller = start_of(with_changes(resolved, {"model.sh_degree": 1}), ring())
+    assert "of a.ply, their harmonics cut; low" in smaller.description.replace(f"{tmp_path}/", "")
+
+
+def test_gaussians_keep_their_place_where_the_data_is_far_away(tmp_path):
+    given = gaussians_within_ranges(40, degree=0)
+    far = replace(given, origin=(4e6, 0.0, -7.0))
+    far.save(tmp_path / "a.ply")
+    dataset = replace(ring(), origin=(4e6, 0.0, -5.0))
+    found = gaussians_of(dataset, init={"gaussians": tmp_path / "a.ply"}, model={"sh_degree": 0})
+    np.testing.assert_allclose(found.means, given.means - [0, 0, 2], atol=1e-6)
+    assert found.origin == (4e6, 0.0, -5.0)
+
+
+def test_points_of_a_file_of_gaussians_are_told_from_them(tmp_path):
+    for suffix in ("ply", "spz"):
+        gaussians_within_ranges(40, degree=0).save(tmp_path / f"a.{suffix}")
+    cloud = config(init={"point_cloud": tmp_path / "a.ply"})
+    assert start_of(resolve_defaults(cloud, ring()), ring()).description == (
+        f"the points of {tmp_path / 'a.ply'} (their scales, rotations and opacities are not used: "
+        "set init.gaussians for that), coloured"
+    )
+    with pytest.raises(UserError, match=r"a\.spz: holds Gaussians, no points; set init\.gaussians"):
+        gaussians_of(ring(), init={"point_cloud": tmp_path / "a.spz"})
+    for other in ({"start": "random"}, {"point_cloud": "b.ply"}, {"half_extent": 1.0}):
+        with pytest.raises(ValueError, match=r"init\.\w+ must be \w+ with init\.gaussians, got"):
+            config(init={"gaussians": "a.ply", **other})
