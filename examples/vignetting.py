@@ -1,6 +1,5 @@
 """An effect of a fit: the lens darkens the corners of photographs, by a factor that is fitted."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from pydantic import Field
@@ -36,8 +35,3 @@ class Vignetting(OptimisedEffect):
         strength = self.parameters(view)["strength"]
         falloff = 1 - strength * view.uploads[self.name].array
         return mi.TensorXf(image.array * falloff, image.shape)
-
-    def after_backward(self, fit, view, derivatives):
-        """Take a step of Adam."""
-        dr.set_grad(self.parameters(view), derivatives)
-        self.step(view, fit.rate_decay)
