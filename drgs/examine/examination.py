@@ -167,6 +167,7 @@ def examine(
             continue
         decision, base = _try(finding, base, folds, partial(progress, finding.effect), end)
         decisions.append(decision)
+    decisions.append(_reject(look_for_moving_things(base)))  # beside all that was chosen
     num_held_out = sum(len(fold.test) for fold in folds[: base.num_folds])
     return Examination(tuple(decisions), num_held_out, time.perf_counter() - started)
 
@@ -291,7 +292,7 @@ def _findings(fit: ShortFit) -> Iterator[Finding]:
     """Yield the findings of what is shipped and of installed extensions."""
     effects = sorted((extension.value for extension in EFFECTS.all()), key=lambda e: e.order)
     looks = [_look_for_background, look_for_bad_photographs, *(e.look_for for e in effects)]
-    for look in (*looks, look_for_moving_things):
+    for look in looks:
         found = look(fit)
         yield from [found] if isinstance(found, Finding) else found or ()
 
