@@ -32,6 +32,8 @@ IMAGE_FOLDERS = ("images", "input", "photos", "rgb")  # of photographs, for conv
 
 _IMAGE_FOLDER = re.compile(rf"(?:{'|'.join(IMAGE_FOLDERS)})(?:_[0-9]+)?")
 
+SMALLER = 2, 4, 8  # photographs of a half, a quarter, an eighth of the size, as in images_4
+
 MASK_FOLDERS = ("masks", "mask")
 
 MASK_ENDINGS = (".mask", "_mask", "-mask")  # before the suffix of a photograph's mask
@@ -146,6 +148,8 @@ class _FileFinder:
             if is_elsewhere or (start > 0 and self._is_image_folder(parts[start - 1]))
         ]
         places += [] if first else [[IMAGE_FOLDERS[0], *parts]]
+        if first == 0 and len(parts) > 1 and parts[0] in IMAGE_FOLDERS:
+            places += [[f"{parts[0]}_{factor}", *parts[1:]] for factor in SMALLER]
         matches = (self._search_below(place, suffixes) for place in places if place)
         return next(filter(None, matches), [])
 

@@ -23,6 +23,7 @@ from drgs.config.extensions import READERS
 from drgs.config.schema import DataConfig
 from drgs.core.errors import UserError, format_names, note_user, one_line
 from drgs.core.folders import digest
+from drgs.datasets.files import SMALLER
 from drgs.datasets.images import (
     MemoryStore,
     Pixels,
@@ -34,6 +35,7 @@ from drgs.datasets.images import (
     downscale_mask,
     downscaled_size,
     is_array,
+    is_scaled,
     num_threads,
     placeholder_pixels,
     read_depth,
@@ -257,6 +259,11 @@ def _intrinsics(
     frame: TransformsFrame, shape: tuple[int, ...], size: tuple[int, int]
 ) -> Intrinsics:
     values, (height, width) = frame.values, shape[:2]
+    folders = frame.files["image"].parts[:-1]
+    is_smaller = any(part.endswith(tuple(f"_{factor}" for factor in SMALLER)) for part in folders)
+    if is_smaller and values.w is not None and values.h is not None:
+        whole = round(values.w), round(values.h)
+        width, height = whole if is_scaled((width, height), whole) else (width, height)
     for key, given, actual in (("w", values.w, width), ("h", values.h, height)):
         if given is not None and given != actual:
             raise UserError(

@@ -345,3 +345,19 @@ def test_long_view_names_are_shortened(file):
     names = unique_names([file.format(i) for i in range(2)])
     assert len(set(names)) == 2
     assert all(len(os.fsencode(name)) <= 220 and "/" not in name for name in names)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_photographs_that_are_there_in_a_smaller_size_alone_are_used(photographs, factor):
+    """The folders of nerfstudio; cameras are scaled as the photographs are."""
+    path = photographs / "transforms.json"
+    edit(path, lambda m: m.update(w=8 * factor, h=6 * factor, fl_x=9.0, fl_y=None, cx=5.0, cy=3.0))
+    (photographs / "images").rename(photographs / f"images_{factor}")
+    dataset, notes = load_noting(photographs)
+    view = dataset.train[0]
+    assert (view.width, view.height) == (8, 6)
+    assert (view.fx, view.fy) == pytest.approx((9 / factor, 9 / factor))
+    assert (view.cx, view.cy) == pytest.approx((5 / factor, 3 / factor))
+    assert any(f"images_{factor}/00.png for " in note for note in notes), notes
+    (photographs / f"images_{factor}").rename(photographs / "images")
+    assert "w must be the image's size, 8 px" in refusal(photographs)
