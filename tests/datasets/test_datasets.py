@@ -358,6 +358,6 @@ def test_photographs_that_are_there_in_a_smaller_size_alone_are_used(photographs
     assert (view.width, view.height) == (8, 6)
     assert (view.fx, view.fy) == pytest.approx((9 / factor, 9 / factor))
     assert (view.cx, view.cy) == pytest.approx((5 / factor, 3 / factor))
-    assert any(f"images_{factor}/00.png for " in note for note in notes), notes
+    assert any(f"images_{factor}/09.png for images/09.png" in note for note in notes), notes
     (photographs / f"images_{factor}").rename(photographs / "images")
     assert "w must be the image's size, 8 px" in refusal(photographs)
