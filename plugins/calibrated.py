@@ -183,8 +183,7 @@ class CalibratedSensor(mi.Sensor):
 
     def camera_from_state(self, state: SensorState) -> Camera:
         """Return the camera with the sensor's lens."""
-        camera = self._pinhole(state)
-        return camera.with_lens(self.lens.with_coefficients(state.device))
+        return self._pinhole(state).with_lens(self.lens.with_coefficients(state.device))
 
     def num_poses(self) -> int:
         """Return the number of poses whose images are averaged."""

@@ -250,10 +250,7 @@ class TrainingEffect(Protocol):
 def training_effects(
     config: FitConfig, dataset: Dataset, given: Sequence[TrainingEffect] = ()
 ) -> list[TrainingEffect]:
-    """Return the effects that take part in a fit, in the order in which they act.
-
-    given: effects besides those of the configuration.
-    """
+    """Return a fit's effects in the order in which they act; given: besides the configuration's."""
     effects = [*given]
     for extension in EFFECTS.all():
         if extension.value.is_used(config, dataset):
