@@ -32,10 +32,7 @@ class LocalServer(viser.ViserServer):
 
 @contextmanager
 def run_server(port: int | None, option: str) -> Iterator[LocalServer]:
-    """Run a server with an empty page within the block.
-
-    port: None for the first free one from 8080 on; option: its name on the command line.
-    """
+    """Serve an empty page within the block; port: None: first free from 8080; option: its name."""
     if port is not None:
         _check_free(port, option)
     # websockets logs a traceback for each browser that leaves while it connects.
