@@ -110,10 +110,9 @@ def rasterization(
     near_plane: z in the camera, scene units, below which means are not seen; eps2d: px^2 added to
     the projected covariance; backgrounds: (C, D) behind the splats, None: 0; render_mode: ``RGB``,
     ``D`` (the sum of alpha-weighted depths), ``ED`` (that divided by alpha), ``RGB+D``, ``RGB+ED``;
-    rasterize_mode: ``classic`` or ``antialiased`` (opacities are scaled such that the low-pass
-    keeps a splat's integral); approximations: other values of
-    :class:`drgs.config.approximations.Approximations`, such as ``projection="exact"`` or
-    ``order="pixel"``.
+    rasterize_mode: ``classic`` or ``antialiased`` (opacities are scaled to keep splats' integrals);
+    approximations: other values of :class:`drgs.config.approximations.Approximations`, such as
+    ``projection="exact"`` or ``order="pixel"``.
 
     Returns images (C, H, W, X), X = D, 1 or D + 1 with the depth last; alphas (C, H, W, 1); and a
     dictionary with ``means2d`` (C, N, 2) px, ``depths`` (C, N), ``conics`` (C, N, 3), the numbers
@@ -202,9 +201,8 @@ def _approximations(
             "rasterization(): sh_direction is of spherical harmonics; give sh_degree, and colors "
             "of shape (N, K, 3)"
         )
-    antialiased = rasterize_mode == "antialiased"
     try:
-        return Approximations(low_pass=eps2d, antialiased=antialiased, **others)
+        return Approximations(low_pass=eps2d, antialiased=rasterize_mode == "antialiased", **others)
     except ValueError as error:
         reason = str(error).replace("low_pass", "eps2d")
         raise ValueError(f"rasterization(): {reason}") from None

@@ -183,8 +183,7 @@ class CalibratedSensor(mi.Sensor):
 
     def camera_from_state(self, state: SensorState) -> Camera:
         """Return the camera with the sensor's lens."""
-        camera = self._pinhole(state)
-        return camera.with_lens(self.lens.with_coefficients(state.device))
+        return self._pinhole(state).with_lens(self.lens.with_coefficients(state.device))
 
     def num_poses(self) -> int:
         """Return the number of poses whose images are averaged."""
@@ -280,6 +279,11 @@ def _lens(props: mi.Properties) -> Lens:
     except UserError as error:
         raise PluginError(str(error)) from error
     names = model.coefficient_names()
+    if taken := ({*KNOWN} - {*COEFFICIENTS}).intersection(names):
+        raise PluginError(
+            f"calibrated: lens '{kind}' has coefficients with the names of other properties, "
+            f"{', '.join(sorted(taken))}; rename them"
+        )
     known = dict.fromkeys((*COEFFICIENTS, *names))
     given = read(props, {name: number(0.0) for name in known if name in props})
     for name in given:

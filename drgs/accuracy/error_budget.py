@@ -106,10 +106,7 @@ def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:
 
 
 def shutter_samples(cameras: Sequence[Camera]) -> tuple[Level, ...]:
-    """Return numbers of times of an open shutter, if a camera has one; costs relative to its own.
-
-    Twice the last one is taken for exact.
-    """
+    """Return numbers of times of an open shutter, by relative cost; twice the last is exact."""
     shutters = [one.shutter for one in cameras]
     own = max((one.samples for one in shutters if isinstance(one, MotionBlur)), default=0)
     counts = sorted({max(1, own // 4), max(1, own // 2), own, 2 * own}) if own else []
@@ -401,8 +398,7 @@ class Search:
     def _squares_of_orders(self, windowed: Sequence[Level], limit: float) -> list[LevelSquares]:
         """Return those of orders, with the best projection; all contain the best image's errors.
 
-        These are extrapolated from two windows of splats, and within a limit not below what the
-        renderer finds.
+        These are extrapolated from two windows of splats; within a limit, not below the renderer's.
         """
         levels, target = (CENTER, *windowed), self._projection | windowed[-1].changes
         squares = [self._differences(self._projection | level.changes, target) for level in levels]
@@ -467,16 +463,14 @@ class Search:
             best, rest = best | other.level.changes, other.in_windows
         measured = self._differences(changes, best) + rest
         if self._most_samples:
-            samples = {SAMPLES: candidate.choice.changes[SAMPLES]}
-            measured += self._squares_of_samples(samples)
+            measured += self._squares_of_samples({SAMPLES: candidate.choice.changes[SAMPLES]})
         return measured
 
     def cheapest(self, budget: float) -> tuple[int, list[float], list[float]]:
         """Return the place in ``front`` of the cheapest choice within a budget.
 
         Also the errors of its views, and those of all of ``front``. Sums are corrected by what was
-        measured, of other choices by what was measured last. Raises ValueError if no choice is
-        within the budget.
+        measured, of other choices by what was measured last. ValueError if none is.
         """
         found: dict[int, np.ndarray] = {}  # of this budget: the choice depends on no other one
         correction, last = 1.0, len(self.front) - 1

@@ -11,12 +11,11 @@ pixel, the smallest squared Mahalanobis distance from the mean, rho^2, and its d
 
     rho^2 = |e|^2 / D,  z = z_mean a / D,  a = 1 - kappa . e,  D = a^2 + h |e|^2
 
-*Proof.* The distance of a point from a line is that of their projections along the line.
-Projecting along the pixel's ray instead of the mean's changes the 2x3 projection A to
-A - d e_z^T / z_mean, and so the projected covariance from C to C - d k^T - k d^T + w d d^T, whose
-inverse (Sherman-Morrison, twice) gives d^T (...)^-1 d = |e|^2 / D. (The affine approximation is the
-first order in the size of the splat; D = 1 there.) The peak is behind the camera where a <= 0: no
-falloff.
+*Proof.* A point's distance from a line is that of their projections along it. Projecting along the
+pixel's ray instead of the mean's changes the 2x3 projection A to A - d e_z^T / z_mean, and so the
+projected covariance from C to C - d k^T - k d^T + w d d^T, whose inverse (Sherman-Morrison, twice)
+gives d^T (...)^-1 d = |e|^2 / D. (The affine approximation is the first order in the size of the
+splat; D = 1 there.) The peak is behind the camera where a <= 0: no falloff.
 
 The low-pass widens the Gaussian parallel to the film, which changes C and neither k nor w.
 
@@ -54,6 +53,7 @@ from drgs.accuracy.peaks import (
     MAX_EXPONENT,
     UNBOUNDED_OUTLINE,
     AffineDepths,
+    OutlinedFalloff,
     bounding_cone,
     seen_along,
 )
@@ -77,8 +77,7 @@ from drgs.splatting.projection import (
 
 def is_still_pinhole(camera: Camera) -> bool:
     """Return whether the splats of this module are those of the camera, or of ``lens_rays``."""
-    is_still = camera.shutter is None and camera.reading is None
-    return is_still and isinstance(camera.lens, Pinhole)
+    return camera.shutter is None and camera.reading is None and isinstance(camera.lens, Pinhole)
 
 
 def exact_shape(
@@ -113,8 +112,7 @@ def exact_shape(
 
 def closest_on_film(camera: Camera, x: Float, y: Float) -> Array2f:
     """Return the point of the film that is closest to a point of its plane, px."""
-    t = types_of(type(x))
-    return dr.clip(t.Array2f(x, y), camera.film_start, camera.film_end)
+    return dr.clip(types_of(type(x)).Array2f(x, y), camera.film_start, camera.film_end)
 
 
 @dataclass(frozen=True)
@@ -127,7 +125,7 @@ class RayFootprint(MicroTileFootprint):
 
 
 @dataclass(frozen=True)
-class RayFalloff(GaussianFalloff):
+class RayFalloff(OutlinedFalloff):
     """alpha = o exp(-rho^2 / 2), with rho^2 the smallest along the pixel's ray.
 
     Geometry: that of :class:`GaussianFalloff`, then g (2), h; all as :func:`exact_shape` gives
@@ -162,15 +160,6 @@ class RayFalloff(GaussianFalloff):
         ray = splats.ray
         assert ray is not None, "as exact_shape makes them"
         return [*super().differentiable(splats), ray.tilt_x, ray.tilt_y, ray.spread]
-
-    @override
-    def bounds(
-        self, splats: Splats2D, geometry: list[Float], reach: Float
-    ) -> tuple[Array2f, Array2f]:
-        x, y, p, r, s = self.outline(geometry, reach)
-        Array2f = types_of(type(p)).Array2f
-        half_sizes = Array2f(dr.sqrt(1 + dr.square(r / s)) / p, 1 / s)
-        return Array2f(x, y), dr.sqrt(reach) * half_sizes
 
     @override
     def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
@@ -276,11 +265,6 @@ class RayFalloff(GaussianFalloff):
             scale * z_y,
             math.log(2) / WHITENING_SCALE**2 * bb,
         ]
-
-    @override
-    def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
-        count = super().num_geometry
-        return super().pack_tangents(geometry, tangents[:count]) + list(tangents[count:])
 
     @override
     def tangent(

@@ -46,6 +46,7 @@ from drgs.accuracy.peaks import (
     MAX_EXPONENT,
     UNBOUNDED_OUTLINE,
     AffineDepths,
+    OutlinedFalloff,
     bounding_cone,
     seen_along,
 )
@@ -103,8 +104,7 @@ def lens_shape(
         jacobian = [reading.turn.T @ row for row in jacobian]
         depth = reading.turn.T @ depth
         origin = reading.travel + (0 if origin is None else reading.turn.T @ origin)
-    ray = LensRayTerms(*kappa, h, jacobian=jacobian, depth=depth, origin=origin)
-    return replace(film, ray=ray)
+    return replace(film, ray=LensRayTerms(*kappa, h, jacobian=jacobian, depth=depth, origin=origin))
 
 
 @dataclass(frozen=True)
@@ -137,10 +137,7 @@ def has_origins(camera: Camera) -> bool:
 
 @dataclass(frozen=True)
 class LensRayFootprint(MicroTileFootprint):
-    """The same, with the inputs of the derivatives of f = rho^2, at the 16 pixels.
-
-    u and v are e.
-    """
+    """The same, with inputs of the derivatives of f = rho^2, at the 16 pixels; u and v are e."""
 
     along: list[Float]  # t of the peak
     d_e: tuple[list[Float], list[Float]]  # derivatives of f with respect to e
@@ -152,7 +149,7 @@ class LensRayFootprint(MicroTileFootprint):
 
 
 @dataclass(frozen=True)
-class LensRayFalloff(GaussianFalloff):
+class LensRayFalloff(OutlinedFalloff):
     """alpha = o exp(-rho^2 / 2) along each pixel's ray, behind any lens.
 
     Geometry: that of :class:`GaussianFalloff`; then J (6), n (3), kappa (2) and h, to base 2, and
@@ -214,15 +211,6 @@ class LensRayFalloff(GaussianFalloff):
         kappa_h = [ray.tilt_x / scale, ray.tilt_y / scale, ray.spread / scale**2]
         origin = [] if ray.origin is None else [*ray.origin]
         return [*ray.jacobian[0], *ray.jacobian[1], *ray.depth, *kappa_h, *origin]
-
-    @override
-    def bounds(
-        self, splats: Splats2D, geometry: list[Float], reach: Float
-    ) -> tuple[Array2f, Array2f]:
-        x, y, p, r, s = self.outline(geometry, reach)
-        t = types_of(type(p))
-        half_sizes = t.Array2f(dr.sqrt(1 + dr.square(r / s)) / p, 1 / s)
-        return t.Array2f(x, y), dr.sqrt(reach) * half_sizes
 
     @override
     def outline(self, geometry: list[Float], reach: Float) -> list[Float]:
@@ -332,14 +320,13 @@ class LensRayFalloff(GaussianFalloff):
         d_kx, d_ky = -dr.dot(splat.e1, a), -dr.dot(splat.e2, a)
         e1, e2 = e1 - kx * a, e2 - ky * a
         d_jx, d_jy = p * e1, r * e1 + s * e2
-        log2_opacity = self.log2_opacity(geometry)
         derivatives = [
             -dr.dot(d_jx, splat.depth),
             -dr.dot(d_jy, splat.depth),
             WHITENING_SCALE * dr.dot(e1, jx),
             WHITENING_SCALE * dr.dot(e1, jy),
             WHITENING_SCALE * dr.dot(e2, jy),
-            dr.select(w == 0, 0, w * dr.exp2(-log2_opacity)),
+            dr.select(w == 0, 0, w * dr.exp2(-self.log2_opacity(geometry))),
             *d_jx,
             *d_jy,
             *a,
@@ -351,10 +338,6 @@ class LensRayFalloff(GaussianFalloff):
             return derivatives
         o1, o2, b = sums[10:]
         return [*derivatives, *(math.log(2) * (o1 * splat.e1 + o2 * splat.e2 - b * splat.a))]
-
-    @override
-    def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
-        return super().pack_tangents(geometry, tangents[:6]) + list(tangents[6:])
 
     @override
     def tangent(
@@ -422,10 +405,7 @@ class _SplatRows:
         return _SplatRows((p, r, s), (jx, jy), n, (kx, ky), h, origin, e1, e2, a)
 
     def cone(self, reach: Float, count: int) -> tuple[list[Array3f], Bool]:
-        """Return peaks along ``count`` rays with |e|^2 = ``reach`` D, and if there are such rays.
-
-        They are relative to the splat's origin.
-        """
+        """Return peaks, from the splat's origin, on rays with |e|^2 = ``reach`` D, and if any."""
         (kx, ky), h = self.kappa, self.h
         cone, peaks = bounding_cone(kx, ky, h, reach), []
         for x, y in _circle(count):

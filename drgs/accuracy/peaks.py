@@ -11,8 +11,9 @@ import drjit as dr
 from typing_extensions import override
 
 from drgs.cameras.camera import Camera
+from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
-from drgs.core.types import Array3f, Bool, Float
+from drgs.core.types import Array2f, Array3f, Bool, Float
 from drgs.splatting.footprint import GaussianFalloff, MicroTileFootprint
 from drgs.splatting.grid import Lanes, TileGrid, load_pixels
 from drgs.splatting.projection import (
@@ -68,6 +69,23 @@ def seen_along(
     return film, (kx, ky), h
 
 
+class OutlinedFalloff(GaussianFalloff):
+    """A falloff along rays, whose bounds are those of its outline; the base class."""
+
+    @override
+    def bounds(
+        self, splats: Splats2D, geometry: list[Float], reach: Float
+    ) -> tuple[Array2f, Array2f]:
+        x, y, p, r, s = self.outline(geometry, reach)
+        Array2f = types_of(type(p)).Array2f
+        half_sizes = Array2f(dr.sqrt(1 + dr.square(r / s)) / p, 1 / s)
+        return Array2f(x, y), dr.sqrt(reach) * half_sizes
+
+    @override
+    def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
+        return super().pack_tangents(geometry, tangents[:6]) + list(tangents[6:])
+
+
 @dataclass(frozen=True)
 class BoundingCone:
     """The rays of a splat, as an ellipse of e: see the module's *Extent*."""
@@ -100,8 +118,7 @@ def bounding_cone(kx: Float, ky: Float, h: Float, reach: Float) -> BoundingCone:
     v00 = dr.sqrt(dr.select(bounded, 1 - q * kx * kx, 1))
     v01, v11 = -q * kx * ky / v00, dr.sqrt(squared) / v00
     shift = -q / squared
-    center = shift * kx, shift * ky
-    return BoundingCone(bounded, depth, q, squared, v00, v01, v11, center)
+    return BoundingCone(bounded, depth, q, squared, v00, v01, v11, (shift * kx, shift * ky))
 
 
 @dataclass(frozen=True)
@@ -168,8 +185,7 @@ class WithAffineDepth:
     ) -> FilmShape:
         """Project; h is not negative. Where slopes are clamped, the splat is the affine one."""
         film = self.shape(rows, camera, position, low_pass)
-        slopes = camera.lens.clamped_slopes(camera, position)
-        m0, m1, n = film_axes(rows, camera, position, slopes)
+        m0, m1, n = film_axes(rows, camera, position, camera.lens.clamped_slopes(camera, position))
         p, r, s = film.conic_factor
         kx, ky = dr.dot(m0, n), dr.dot(m1, n)
         kx, ky = dr.fma(p, kx, r * ky), s * ky

@@ -13,11 +13,10 @@ in the list; the error vanishes as K grows, except for alphas below :data:`UNORD
 Insertion into a sorted window takes K comparisons with selections at every pixel, without branches.
 
 **Adjoint.** The pixels of a micro-tile composite different splats at the same time, while a splat's
-partial derivatives are sums over pixels. Two passes therefore compute each pixel's contribution,
-and store w = T alpha and d loss / d ln(alpha) by splat; a third pass sums over the pixels. b, the
-derivative behind a splat (see ``drgs.splatting.rasterize``), is the sum over all splats minus that
-over the splats in front. To avoid cancellation, each sum is stored as two numbers, which are exact
-to twice the precision.
+partial derivatives are sums over pixels. Two passes therefore store w = T alpha and d loss / d
+ln(alpha) by splat and pixel; a third pass sums over the pixels. b, the derivative behind a splat
+(see ``drgs.splatting.rasterize``), is the sum over all splats minus that over the splats in front.
+To avoid cancellation, each sum is stored as two numbers, which are exact to twice the precision.
 """
 
 from __future__ import annotations

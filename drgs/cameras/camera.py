@@ -144,8 +144,7 @@ class Camera(CameraParameters):
     def look_through(self, x: Float, y: Float) -> tuple[Array3f, Array3f, Bool | bool]:
         """Return the ray through a place of the film (px): origin, direction, and if it is one.
 
-        Origin and direction (of any length) are in camera axes. A lens shows nothing beyond
-        the end of its model.
+        Both are in camera axes, the direction of any length. A lens shows nothing beyond its model.
         """
         direction = self.lens.ray(self, x, y)
         origin = self.lens.origin(self, x, y)
@@ -153,8 +152,7 @@ class Camera(CameraParameters):
             return origin, direction, True
         seen, _, _ = self.lens.visibility(replace(self, near=type(self.near)(0)), direction)
         t = types_of(type(self.near))
-        place = self.lens.project_point(self, direction)
-        missed = self.lens.offset(self, t.Array2f(x, y), place)
+        missed = self.lens.offset(self, t.Array2f(x, y), self.lens.project_point(self, direction))
         return origin, direction, seen & (dr.squared_norm(missed) < MAX_RAY_ERROR_PX**2)
 
     def view_directions(self, x: Float, y: Float, count: int) -> tuple[Array3f, Bool | bool, int]:
@@ -170,10 +168,7 @@ class Camera(CameraParameters):
         return camera.rotation.T @ ray, seen, 1
 
     def place_of_ray(self, origin: Array3f, direction: Array3f) -> tuple[Array2f, Float]:
-        """Return the place of a ray on the film, px, and the radius of the aperture.
-
-        origin, direction: camera axes. The radius is in scene units.
-        """
+        """Return the place of a ray (camera axes) on the film, px, and the aperture's radius."""
         if self.aperture is None:
             return self.lens.place_of_ray(self, origin, direction), type(self.near)(0)
         point = self.aperture.in_focus(origin, direction)
@@ -205,10 +200,7 @@ class Camera(CameraParameters):
         return replace(self, **{n: _map(getattr(self, n), function) for n in _DIFFERENTIABLE})
 
     def by_lane(self, width: int) -> Camera:
-        """Return the camera with these numbers stored for each of ``width`` lanes.
-
-        The derivatives of all lanes are then separate, and can be summed in a fixed order.
-        """
+        """Return the camera with its numbers stored by lane: derivatives can be summed in order."""
         lanes = dr.zeros(types_of(type(self.near)).UInt32, width)
         return self.map_numbers(lambda number: dr.gather(type(number), number, lanes))
 
@@ -242,8 +234,5 @@ def _map(value: Any, function: Callable[[Float], Float]) -> Any:
 
 
 def cameras_in_time(camera: Camera, samples: int | None = None) -> list[Camera]:
-    """Return the cameras whose images are averaged: one unless it is blurred by motion.
-
-    samples: number of times of a shutter that is open; None: its own.
-    """
+    """Return cameras whose images are averaged; samples: of motion blur, None: the shutter's."""
     return [camera] if camera.shutter is None else camera.shutter.cameras(camera, samples)

@@ -1,7 +1,6 @@
 """Models of distortion: their polynomials, and radial and tangential terms within a plane.
 
-The plane is that of slopes or that of angles. Coefficients are numbers of the host or Dr.Jit
-scalars.
+The plane is of slopes or angles. Coefficients are numbers of the host or Dr.Jit scalars.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ NEGLIGIBLE_COEFFICIENT = 1e-30
 """A smaller one is as good as 0: at a slope of 1e4, k3 r^6 is 1e-6. With it, roots overflow."""
 
 RADIUS_STEPS = 24
-"""Steps of the search for a radius: most need 4 or 5; next to the end of the function, each at
-least halves the error."""
+"""Steps of the search for a radius: most need 4 or 5; next to the end, each at least halves it."""
 
 UNBOUNDED_SLOPE = 1e4  # a slope that no film shows
 
@@ -192,10 +190,9 @@ class PlaneDistortion(Protocol):
         at_x, at_y = self.distort(u, v)
         dx, dy = x - at_x, y - at_y
         with dr.suspend_grad():
-            jacobian = self.distortion_jacobian(u, v)
-            xx, xy, yx, yy = jacobian
+            xx, xy, yx, yy = self.distortion_jacobian(u, v)
             per_determinant = 1 / (xx * yy - xy * yx)
-            xx, xy, yx, yy = (value * per_determinant for value in jacobian)
+            xx, xy, yx, yy = (value * per_determinant for value in (xx, xy, yx, yy))
         next_u, next_v = u + (yy * dx - xy * dy), v + (xx * dy - yx * dx)
         inside = self.is_within(next_u, next_v)
         return dr.select(inside, next_u, u), dr.select(inside, next_v, v)

@@ -127,10 +127,7 @@ class Lens:
 
     @classmethod
     def from_coefficients(cls, **coefficients: float) -> Lens:
-        """Return the lens with these coefficients.
-
-        Raises :class:`UserError` if one that has no default is missing, or is too large.
-        """
+        """Return the lens; UserError for a coefficient that is missing, or too large."""
         check_coefficients(coefficients)
         try:
             return cls(**{name: float(value) for name, value in coefficients.items()})
@@ -210,10 +207,7 @@ class Lens:
         return near, far
 
     def view_direction(self, camera: CameraParameters, offset: Array3f) -> Array3f:
-        """Return the direction in which a point is seen, world, of any length.
-
-        offset: from the camera's centre to the point, world.
-        """
+        """Return a point's direction, world, any length; offset: from the centre to it, world."""
         return offset
 
     def origin(self, camera: CameraParameters, x: Float, y: Float) -> Array3f:
@@ -343,10 +337,7 @@ def check_coefficients(given: Mapping[str, float]) -> None:
 
 
 def with_unseen_on_axis(position: Array3f, seen: Bool) -> tuple[Bool, Array3f, Float]:
-    """Return ``seen``, positions (camera axes), and their z.
-
-    Points that are not seen are moved to (0, 0, 1), where every lens is differentiable.
-    """
+    """Return ``seen``, positions, z; the unseen at (0, 0, 1), where lenses are differentiable."""
     x, y, z = position
     z = dr.select(seen, z, 1)
     return seen, type(position)(dr.select(seen, x, 0), dr.select(seen, y, 0), z), z

@@ -40,18 +40,14 @@ class Motion(Shutter):
     def relative_motion(
         camera: Camera, rotation: Matrix3f, center: Array3f
     ) -> tuple[Array3f, Array3f]:
-        """Return ``travel`` and ``turn`` from the pose of ``camera`` to another.
-
-        rotation: world to camera; center: world.
-        """
+        """Return ``travel`` and ``turn`` to a pose; rotation: world to camera; center: world."""
         return center - camera.center, rotation_vector(rotation @ camera.rotation.T)
 
     @override
     def pose(self, camera: Camera, time: Scalar) -> Camera:
-        turn = rotation_matrix(self.turn * time)
         return replace(
             camera,
-            rotation=turn @ camera.rotation,
+            rotation=rotation_matrix(self.turn * time) @ camera.rotation,
             center=camera.center + self.travel * time,
             shutter=None,
         )
@@ -65,8 +61,7 @@ class Motion(Shutter):
 
         camera: at the time in question; offset: from its centre to the point, world.
         """
-        turn = dr.cross(self.turn, camera.rotation @ offset)
-        return turn - camera.rotation @ self.travel
+        return dr.cross(self.turn, camera.rotation @ offset) - camera.rotation @ self.travel
 
 
 @dataclass(frozen=True)

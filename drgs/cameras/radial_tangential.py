@@ -133,10 +133,7 @@ class RadialTangential(PlaneDistortion, Perspective):
 
 
 def _slopes_on_border(lens: RadialTangential, camera: CameraParameters) -> tuple[Array2f, Array2f]:
-    """Return the box around the slopes of points on the film's border.
-
-    Where the lens does not see all of them, only the end of its model bounds the slopes.
-    """
+    """Return the box of slopes on the film's border; if not all are seen, up to the model's end."""
     t = types_of(type(camera.near))
     side = dr.linspace(t.Float, 0, 1, BORDER_POINTS_PER_SIDE)
     zero, one = dr.zeros(t.Float, BORDER_POINTS_PER_SIDE), dr.ones(t.Float, BORDER_POINTS_PER_SIDE)

@@ -56,10 +56,7 @@ def perspective_sensors(scene: mi.Scene) -> list[SceneSensor]:
 
 
 def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) -> CaptureSettings:
-    """Return ``settings`` with values from the scene for those that are not named in ``given``.
-
-    Raises :class:`UserError` for a setting that the cameras do not use.
-    """
+    """Return settings from the scene but for ``given`` ones; UserError for one that is not used."""
     sensors = perspective_sensors(scene)
     if "cameras" not in given:
         has_enough = len(sensors) >= ENOUGH_SENSORS and not given & NOT_OF_SENSORS
@@ -129,9 +126,8 @@ def _fov(settings: CaptureSettings, narrower: float) -> float:
 def target_and_distance(scene: mi.Scene, settings: CaptureSettings) -> tuple[np.ndarray, float]:
     """Return the target of cameras around a scene, (3,) world, and their distance from it.
 
-    By default, the bounding box's sphere just fits between the edges of the image: radius /
-    sin(fov / 2), with the narrower field of view. NeRF-synthetic's 4.03 is 10% less: its box has
-    empty corners.
+    By default, the bounding box's sphere just fits into the image: radius / sin(fov / 2), with the
+    narrower field of view. NeRF-synthetic's 4.03 is 10% less: its box has empty corners.
     """
     low, high = bounding_box(scene)
     target = (low + high) / 2 if settings.target is None else np.array(settings.target)

@@ -120,10 +120,7 @@ class CaptureView:
 
 
 def load_scene(path: Path) -> mi.Scene:
-    """Load a scene from an XML file, or from a Python file with a function ``scene()``.
-
-    Raises :class:`UserError` for a missing file, and for one of another variant.
-    """
+    """Load XML, or a Python file's ``scene()``; UserError: missing, or of another variant."""
     try:
         if path.suffix == ".py":
             scene = load_scene_dictionary(_scene_dictionary(path), path)
@@ -244,8 +241,7 @@ class CaptureCamera:
 
     def linear(self, view: CaptureView) -> np.ndarray:
         """Return (H, W, 4) float64: radiance times alpha, and alpha."""
-        to_world = view.pose @ OPENGL_TO_MITSUBA
-        self._parameters["to_world"] = mi.Transform4f(to_world)
+        self._parameters["to_world"] = mi.Transform4f(view.pose @ OPENGL_TO_MITSUBA)
         self._parameters["x_fov"] = mi.Float(math.degrees(view.fov))
         self._parameters.update()
         (width, height), spp = self._settings.size, self._settings.spp
@@ -311,10 +307,7 @@ def view_rays(view: CaptureView, spots: np.ndarray, settings: CaptureSettings) -
 def first_hits(
     scene: mi.Scene, origin: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where rays meet a surface, (N, 3) float32 world, and whether they do, (N,) bool.
-
-    Rays pass surfaces that shine.
-    """
+    """Return where rays meet a surface that is no lamp, (N, 3) float32 world, and if, (N,) bool."""
     ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(directions.T))
 
     def intersect(ray: mi.Ray3f) -> tuple[mi.SurfaceInteraction3f, Bool]:

@@ -112,9 +112,12 @@ class Extension(Generic[T]):
 class Registry(Generic[T]):
     """The implementations of one extension point, by name."""
 
-    def __init__(self, kind: str, group: str) -> None:
-        """kind: of the extensions, for messages; group: of their entry points."""
-        self.kind, self.group = kind, group
+    def __init__(self, kind: str, group: str, unique: str = "") -> None:
+        """kind: of the extensions, for messages; group: of their entry points.
+
+        unique: name of an attribute that no two extensions have the same value of.
+        """
+        self.kind, self.group, self.unique = kind, group, unique
         self._extensions: dict[str, Extension[T]] = {}
         _registries.append(self)
 
@@ -139,6 +142,13 @@ class Registry(Generic[T]):
             others = (r for r in _registries if r is not self and name in r._extensions)
             if name not in shipped and (other := next(others, None)) is not None:
                 raise ValueError(f'a {other.kind} is called "{name}" already: names are sections')
+            if self.unique and name not in shipped:
+                one = getattr(value, self.unique)
+                others = {**shipped, **self._extensions}.keys() - {name}
+                if same := [o for o in others if getattr(self.get(o).value, self.unique) == one]:
+                    raise ValueError(
+                        f'{self.kind} "{name}": {self.unique} {one} is that of {same[0]} already'
+                    )
             self._extensions[name] = Extension(self.kind, name, cast(T, value), section, module)
             return value
 

@@ -72,8 +72,7 @@ class RandomBackground(TrainingEffect):
 
     @override
     def before_render(self, fit: FitState, view: TrainingView) -> None:
-        rng = np.random.default_rng([self.seed, RANDOM_STREAM, fit.iteration])
-        color = rng.uniform(size=3)
+        color = np.random.default_rng([self.seed, RANDOM_STREAM, fit.iteration]).uniform(size=3)
         set_background(fit.integrator, color)
         # No literal, or every colour would be a new kernel.
         shift = mi.Color3f(*map(float, color - self.background))

@@ -178,6 +178,9 @@ class TrainingEffect(Protocol):
         """
         return None
 
+    def check(self, dataset: Dataset) -> None:
+        """Raise :class:`UserError` for a dataset whose views the effect does not fit."""
+
     def upload(self, view: View) -> object:
         """Return the effect's data of a view, on the device: see ``TrainingView.uploads``."""
 
@@ -250,16 +253,15 @@ class TrainingEffect(Protocol):
 def training_effects(
     config: FitConfig, dataset: Dataset, given: Sequence[TrainingEffect] = ()
 ) -> list[TrainingEffect]:
-    """Return the effects that take part in a fit, in the order in which they act.
-
-    given: effects besides those of the configuration.
-    """
+    """Return a fit's effects in the order in which they act; given: besides the configuration's."""
     effects = [*given]
     for extension in EFFECTS.all():
         if extension.value.is_used(config, dataset):
             section = section_of(extension, config.sections)
             effects.append(extension.value.from_config(config, dataset, section))
     effects.sort(key=lambda effect: effect.order)
+    for effect in effects:
+        effect.check(dataset)
     names = [effect.name for effect in effects]
     if "" in names or len({*names}) < len(names):
         raise UserError(f"effects: names must be unique, got {', '.join(names)}")

@@ -185,8 +185,7 @@ class CameraRefinement(OptimisedEffect):
         shared = {"log_focals": config.focal_lr, "shifts": config.principal_lr}
         # A rate of 0 disables its parameter.
         shapes |= {name: (1, 2) for name, rate in shared.items() if rate > 0}
-        values = {name: np.zeros(shape) for name, shape in shapes.items()}
-        super().__init__(values, rates | shared)
+        super().__init__({name: np.zeros(shape) for name, shape in shapes.items()}, rates | shared)
         self.numbers: dict[int, dict[str, dr.ArrayBase]] = {}  # of the step's sensors, by view
 
     @override
@@ -278,10 +277,7 @@ class CameraRefinement(OptimisedEffect):
 
     @property
     def lens_change(self) -> LensChange:
-        """The changes that all cameras share.
-
-        Raises :class:`UserError` for focal lengths that no camera has.
-        """
+        """The changes that all cameras share; UserError for focal lengths that no camera has."""
         shared = self.optimizers.keys() & {"log_focals", "shifts"}
         values, changes = self.numpy(), {}
         numbers = {name: values[name][0].astype(np.float64) for name in shared}
@@ -306,8 +302,7 @@ class CameraRefinement(OptimisedEffect):
     def write(self, folder: Path, dataset: Dataset) -> None:
         """Write ``cameras.json``: the refined training cameras, as ``transforms.json`` has them."""
         cameras = cameras_json(self.refined_views(dataset.train), dataset.origin)
-        content = {"lens_change": asdict(self.lens_change), **cameras}
-        write_json(folder / CAMERAS, content)
+        write_json(folder / CAMERAS, {"lens_change": asdict(self.lens_change), **cameras})
 
 
 def _middle(values: Sequence[float]) -> float:

@@ -109,10 +109,9 @@ class ColorCorrection(CenteredEffect):
         exposures = gains.mean(axis=1)
         by_view = trimmed_deviation(exposures - np.median(exposures))
         by_color = float((gains - exposures[:, None]).std())
-        evidence = f"brightness differs by {by_view:.1%}, colours by {by_color:.1%}"
         return Finding(
             "exposure and white balance",
-            evidence,
+            f"brightness differs by {by_view:.1%}, colours by {by_color:.1%}",
             is_likely=by_view > MIN_BRIGHTNESS_DEVIATION or by_color > MIN_COLOR_DEVIATION,
             changes={"colors.lr": EXAMINED_LR},
         )
@@ -144,8 +143,7 @@ class ColorCorrection(CenteredEffect):
     @override
     def penalties(self, view: TrainingView) -> Iterator[Float]:
         """Yield the mean square by which the transform differs from the identity."""
-        difference = self.matrix - as_numbers(IDENTITY)
-        yield self.weight * dr.mean(dr.square(difference))
+        yield self.weight * dr.mean(dr.square(self.matrix - as_numbers(IDENTITY)))
 
     def transforms(self) -> np.ndarray:
         """Return the transforms of all training views, (V, 3, 4)."""
@@ -160,10 +158,7 @@ class ColorCorrection(CenteredEffect):
 
 
 def transform_colors(image: TensorXf, matrix: TensorXf) -> TensorXf:
-    """Return A y with y = (red, green, blue, 1) of each pixel.
-
-    image: (H, W, 3); matrix: A, a tensor (3, 4). Differentiable in both.
-    """
+    """Return A (r, g, b, 1); image: (H, W, 3), matrix: A, (3, 4), both differentiated."""
     return dr.custom(_TransformColors, image=image, matrix=matrix)
 
 

@@ -11,9 +11,8 @@ and each surface's own share is p_k times T_k, the transmittance in front of it:
     T_k = 1 - sum_{i: z_i <= z_k} w_i.
 
 So surfaces change no alpha and no transmittance: they scale features, and one more plane for each
-sums the weights in front. Which splats are in front is decided by the depths by which they are
-ordered: those of their means, or of their peaks at each pixel. Not differentiated: z, p, and that
-decision.
+sums the weights in front. Which splats are in front is decided by the depths that order them: those
+of their means, or of their peaks at each pixel. Not differentiated: z, p, and that decision.
 """
 
 from __future__ import annotations

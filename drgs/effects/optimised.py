@@ -12,10 +12,12 @@ from drjit.opt import Adam
 from typing_extensions import override
 
 from drgs.core.adam import make_optimizer, optimizer_state, restore_optimizer
+from drgs.core.errors import UserError
 from drgs.core.types import Float
 from drgs.effects.base import TrainingEffect, as_numbers
 
 if TYPE_CHECKING:
+    from drgs.datasets.types import Dataset
     from drgs.training.views import FitState, TrainingView
 
 
@@ -33,6 +35,18 @@ class OptimisedEffect(TrainingEffect):
             name: [make_optimizer({name: mi.Float(row)}, rates) for row in value.astype(np.float32)]
             for name, value in values.items()
         }
+
+    @override
+    def check(self, dataset: Dataset) -> None:
+        """Raise :class:`UserError` for other numbers of rows than one, and one for each view."""
+        if type(self)._optimizers_of is not OptimisedEffect._optimizers_of:
+            return  # rows are not those of views
+        for name, rows in self.optimizers.items():
+            if len(rows) not in (1, len(dataset.train)):
+                raise UserError(
+                    f"effect {self.name}: {name} must have 1 row, or {len(dataset.train)} for the "
+                    f"training views, got {len(rows)}"
+                )
 
     def parameters(self, view: TrainingView) -> dict[str, Float]:
         """Return the numbers (K,) of a view, with derivatives enabled."""

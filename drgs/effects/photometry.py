@@ -67,10 +67,7 @@ class Photometry(CenteredEffect):
     @classmethod
     @override
     def look_for(cls, fit: ShortFit) -> list[Finding]:
-        """Compare the brightness of points between photographs, and cameras.
-
-        Splats absorb both, so that a fit with them does not show whether they are needed.
-        """
+        """Compare the brightness of points between photographs, and cameras: splats absorb both."""
         views = (*fit.dataset.test, *fit.dataset.train)
         counts = Counter(camera_key(view) for view in views)
         rows = {key: k for k, (key, n) in enumerate(counts.most_common()) if n >= MIN_CAMERA_VIEWS}
@@ -84,8 +81,7 @@ class Photometry(CenteredEffect):
         if tones.response is not None:
             value, error = np.ptp(tones.response[0]), tones.response[1].max()
             text = f"exponents of cameras differ by {value:.1%} ± {error:.1%}"
-            is_likely = value > max(MIN_RESPONSE, MIN_ERRORS * error)
-            found.append(_finding("response", text, is_likely))
+            found.append(_finding("response", text, value > max(MIN_RESPONSE, MIN_ERRORS * error)))
         return found
 
     @classmethod

@@ -89,8 +89,7 @@ def _rates(points: Array3f, camera: Camera) -> Float:
 
 
 UPDATE_EVERY = 100
-"""Iterations (as in Mip-Splatting's code); also where another stage begins, and after each change
-of the population."""
+"""Iterations, as in Mip-Splatting; also where a stage begins, and after each change of rows."""
 
 
 @EFFECTS.register("smoothing")
@@ -157,8 +156,7 @@ def bake_smoothing(gaussians: Gaussians) -> Gaussians:
 
 
 def _finite_logits(opacities: np.ndarray) -> np.ndarray:
-    tiny = np.finfo(np.float32).tiny
-    opacities = np.clip(opacities, tiny, 1 - np.finfo(np.float32).eps)
+    opacities = np.clip(opacities, np.finfo(np.float32).tiny, 1 - np.finfo(np.float32).eps)
     return (np.log(opacities) - np.log1p(-opacities)).astype(np.float32)
 
 
@@ -180,8 +178,7 @@ def bake_for_viewers(
         s'^2 = max(s^2 - (L - l) / nu^2, 0.04 s^2),   o' = o sum(a sqrt(det C)) / sum(sqrt(det C')),
 
     where C and C' are the covariances on the film, low-pass included, a is what compensation leaves
-    of the opacity, and the sums go over the cameras that see the Gaussian. One that no camera sees
-    keeps its opacity.
+    of the opacity, and the sums go over the cameras that see the Gaussian. Unseen ones keep theirs.
 
     gaussians: Dr.Jit arrays, without a smoothing filter. Detached.
     """
@@ -208,8 +205,7 @@ def _integrals(
     rows = load_rows(gaussians, 0)
     total = dr.zeros(type(rows.logit_opacities), gaussians.num_gaussians)
     for camera in cameras:
-        low_pass = approximations.low_pass
-        splats = project(rows, camera, 0, rule, low_pass=low_pass, least_alpha=0.0)
+        splats = project(rows, camera, 0, rule, low_pass=approximations.low_pass, least_alpha=0.0)
         beside = (splats.means2d < camera.film_start) | (splats.means2d > camera.film_end)
         p, _, s = splats.conic_factor
         seen = splats.visible & ~(beside.x | beside.y)

@@ -8,8 +8,7 @@ with the colour c_i of the point, whose mean is m_i, and, to first order, its ch
 direction v_ij to the camera, the gain g_j, the falloff a_k with s_ij, the squared distance from the
 principal point (1 in corners), and the response p_k, relative to the first camera's. They are found
 by robust least squares (compare Goldman and Chen 2005). Reflections whose second order in the
-direction moves as s does, those of a thing that stays in the middle of all photographs, cannot be
-told from a falloff.
+direction moves as s does, those of a thing in the middle of all photographs, look like a falloff.
 """
 
 from __future__ import annotations
@@ -46,8 +45,7 @@ class Tones(NamedTuple):
 def find_tones(views: Sequence[View], cameras: Sequence[int], gaussians: Gaussians) -> Tones:
     """Return vignetting and responses of cameras 0 to K - 1, each of which has taken some views.
 
-    cameras: of the views. gaussians: numpy arrays, of a fit to them: where points are, and what
-    they hide.
+    cameras: of views. gaussians: numpy, of a fit to them: where points are, and what they hide.
     """
     points = np.asarray(gaussians.means, np.float64)
     points = points[1 / (1 + np.exp(-np.asarray(gaussians.logit_opacities))) > MIN_OPACITY]

@@ -24,12 +24,11 @@ GREY = (0.5, 0.5, 0.5)  # background where none is known: neither hides white no
 def add_cleaning_arguments(parser: CommandParser) -> None:
     """Add the options of :func:`clean` and :func:`reduce_to`."""
     add = parser.add_argument_group("selection").add_argument
-    corners = tuple(f"{axis}{end}" for end in "01" for axis in "XYZ")
     add(
         "--crop",
         type=finite_number,
         nargs=6,
-        metavar=corners,
+        metavar=tuple(f"{axis}{end}" for end in "01" for axis in "XYZ"),
         help="keep the Gaussians inside a box",
     )
     add(
@@ -108,10 +107,7 @@ def _count_or_percentage(text: str) -> Callable[[int], int]:
 
 
 def clean(source: ExportSource, args: argparse.Namespace) -> ExportSource:
-    """Return the Gaussians that the options keep, and print why others are left out.
-
-    Raises :class:`UserError` if none are left.
-    """
+    """Return the Gaussians that the options keep, and print reasons; UserError if none are left."""
     if args.seed_pos is not None and args.filter_cluster is None:
         raise UserError("--seed-pos: needs --filter-cluster")
     gaussians = source.gaussians

@@ -58,8 +58,7 @@ def merge_down(gaussians: Gaussians[np.ndarray], count: int) -> Gaussians[np.nda
         covariances = np.concatenate([covariances[rest], merged])
         masses = np.concatenate([masses[rest], joint])
     kept = take(gaussians, rows)
-    moments = (values[len(rows) :] for values in (means, covariances, masses, sh))
-    merged = _from_moments(*moments)
+    merged = _from_moments(*(values[len(rows) :] for values in (means, covariances, masses, sh)))
     joined = {
         name: np.concatenate([getattr(kept, name), getattr(merged, name)])
         for name in PARAMETER_NAMES

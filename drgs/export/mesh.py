@@ -3,8 +3,7 @@
 Source: Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images",
 SIGGRAPH 1996: a voxel has the mean of (d - z) / t over the views that see it, with the depth d of
 its pixel, its own depth z and the truncation t; at most 1, and without views in which it is below
--1, which is hidden behind the surface. The mesh is where the mean is zero, between voxels that are
-all seen.
+-1, which is hidden behind the surface. The mesh is where the mean is zero, between seen voxels.
 """
 
 from __future__ import annotations
@@ -109,8 +108,7 @@ def mesh_of(images: Sequence[DepthImage], size: int) -> Trimesh:
     layers = max(1, VOXELS_AT_ONCE // (shape[1] * shape[2]))
     for first in range(0, shape[0], layers):
         part, start = slice(first, first + layers), corner + np.array([first * voxel, 0, 0])
-        fused = fuse(images, start, voxel, distance[part].shape)
-        distance[part], colors[part], known[part] = fused
+        distance[part], colors[part], known[part] = fuse(images, start, voxel, distance[part].shape)
     for axis in range(3):  # a cube is known where all eight corners are; its last one stands for it
         shifted = np.moveaxis(known, axis, 0)
         shifted[1:] &= shifted[:-1]

@@ -44,10 +44,7 @@ class VoxelRule:
     contribution: float  # >= 0
 
     def scale_to(self, gaussians: Gaussians[np.ndarray], extent: float) -> VoxelRule:
-        """Return a default with its size in world units, doubled until few enough are visited.
-
-        extent: world units.
-        """
+        """Return a default in world units (as ``extent``), doubled until few enough are visited."""
         size = self.size * extent
         voxels = Voxels(gaussians, size)
         while voxels.num_visits > MAX_VISITS or max(voxels.sides) >= MAX_VOXELS:
@@ -126,10 +123,7 @@ class Voxels:
             yield _keys(voxel - self.origin), row, self.opacities[row] * np.exp(-0.5 * distance)
 
     def solid(self, opacity: float) -> np.ndarray:
-        """Return the sorted keys of voxels of at least this opacity, 1 - exp(-sum).
-
-        The sum is over the contributions, at the points nearest to the means.
-        """
+        """Return sorted keys of voxels of at least this opacity, 1 - exp(-sum of contributions)."""
         keys, sums = np.zeros(0, np.int64), np.zeros(0)
         for voxel, _, value in self.visit(np.flatnonzero(~self.is_wide), at_center=False):
             keys, group = np.unique(np.concatenate([keys, voxel]), return_inverse=True)

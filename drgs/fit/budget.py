@@ -4,9 +4,8 @@
 :class:`Strategy`, in the time of an iteration at the start of a fit, with full images and the first
 Gaussians. A rehearsal of the planned fit converts it to seconds, and the strategy whose curve is
 highest at the deadline is chosen. Curves of another scene predict a time to some ten or twenty per
-cent, so the clock ends the fit (:func:`deadline`): it cuts the last phase, when rates are small,
-or appends iterations at the final rates. The resulting configuration gives the same bytes without a
-clock.
+cent, so the clock ends the fit (:func:`deadline`): it cuts the last phase, when rates are small, or
+appends iterations at the final rates. Its configuration gives the same bytes without a clock.
 """
 
 from __future__ import annotations
@@ -202,8 +201,7 @@ def make_plan(
             curve = curves[strategy.name]
             iterations = curve.iterations_in(seconds / start_s) if seconds > 0 else 0
             if iterations >= MIN_ITERATIONS:
-                psnr = curve.psnr_at(iterations)
-                candidates.append(Candidate(strategy, iterations, psnr))
+                candidates.append(Candidate(strategy, iterations, curve.psnr_at(iterations)))
     if not candidates:
         raise UserError(
             f"--budget: must leave time for {MIN_ITERATIONS} iterations, got "
@@ -305,8 +303,7 @@ def plan_fit(
         end -= results.viewers
         end -= TIME_SHARE * max(0.0, end - time.perf_counter())
     side = min(min(view.width, view.height) for view in dataset.train)
-    seconds = end - time.perf_counter()
-    plan = make_plan(config, num_points, side, seconds, start_s, load_curves())
+    plan = make_plan(config, num_points, side, end - time.perf_counter(), start_s, load_curves())
     return replace(plan, end=end)
 
 

@@ -35,9 +35,8 @@ PIXEL_BYTES, MEASURED_BYTES = 155, 130
 
 START_REACH, FITTED_REACH = 1.3, 0.55
 """Reach of Gaussians, in units of the root of (pixels per Gaussian): N Gaussians in P pixels have
-about N (1 + reach sqrt(P / N))^2 entries. At the start of a fit 0.9 to 1.6 for random points, and
-0.4 on a hull; in fits of the shipped scene with 23,000 and 114,000 Gaussians at 200 to 800 px, 0.42
-to 0.57."""
+about N (1 + reach sqrt(P / N))^2 entries. At the start 0.9 to 1.6 for random points, 0.4 on a hull;
+in fits of the shipped scene with 23,000 and 114,000 Gaussians at 200 to 800 px, 0.42 to 0.57."""
 
 SLOTS = 2.7  # of an entry of fitted Gaussians: 2.0 to 3.7 in the same fits; at the start 4 to 9
 

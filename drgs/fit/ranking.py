@@ -51,11 +51,8 @@ def rank_photographs(
     scores = list(map_ahead(lambda v, image: psnr(image, np.asarray(v.image), v.mask), pairs))
     order = sorted(range(len(views)), key=lambda index: scores[index])
     ranked = [RankedPhotograph(views[index].name, scores[index]) for index in order]
-    off, worst = (
-        np.array(scores) - np.median(scores),
-        tuple(views[index] for index in order[:NUM_HINTS]),
-    )
-    limit = np.median(scores) - OUTLIER_DEVIATIONS * NORMAL * np.median(np.abs(off))
+    worst, middle = tuple(views[index] for index in order[:NUM_HINTS]), np.median(scores)
+    limit = middle - OUTLIER_DEVIATIONS * NORMAL * np.median(np.abs(np.array(scores) - middle))
     for place, (view, image) in enumerate(zip(worst, render(worst), strict=True)):
         factor = max(1, round(view.width / WIDTH_PX))
         small = with_arrays(smaller_view(view, factor))

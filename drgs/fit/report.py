@@ -85,8 +85,7 @@ def write_images(
             write_png(out / SIDE_BY_SIDE / split / f"{view.name}.png", side_by_side(image, view))
         return score(image, view)
 
-    pairs = zip(dataset.test, render(dataset.test), strict=True)
-    return list(map_ahead(finish, pairs))
+    return list(map_ahead(finish, zip(dataset.test, render(dataset.test), strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +106,7 @@ def write_results(
     history: FitHistory,
     metrics: FitMetrics,
 ) -> None:
-    """Write ``curves.png``, ``orbit.webp``, ``viewer.html``, ``report.html``.
-
-    scores: of the test views, in order.
-    """
+    """Write ``curves.png``, ``orbit.webp``, ``viewer.html``, ``report.html``; scores: by view."""
     orbit = orbit_of_views(dataset.train, fitted.gaussians)
     size, fov = orbit_size(dataset.train), field_of_view(dataset.train)
     cameras = orbit.viewpoints(ORBIT_FRAMES, *size, fov)
@@ -136,10 +132,7 @@ class Seconds(NamedTuple):
 def seconds_of_results(
     scene: mi.Scene, dataset: Dataset, num_gaussians: int, sh_degree: int
 ) -> Seconds:
-    """Estimate the time of the results by timing one test view, and two curves.
-
-    num_gaussians, sh_degree: of the final Gaussians.
-    """
+    """Estimate the results' time by timing one test view and two curves, for the last Gaussians."""
     view, x = dataset.test[0], np.linspace(1.0, 100.0, 1000)
     (image,) = render_views(scene, (view,))
     rendered = _seconds_of(lambda: list(render_views(scene, (view,))))
@@ -206,10 +199,7 @@ def write_report(
     metrics: FitMetrics,
     orbit: bytes,
 ) -> None:
-    """Write a self-contained HTML file; only its links refer to files beside it.
-
-    scores: of the test views, in order; orbit: the bytes of an animated WebP.
-    """
+    """Write a self-contained HTML file; scores: by test view; orbit: bytes of an animated WebP."""
     chosen, has_viewer = choose_views([s.psnr for s in scores]), path.with_name(VIEWER).is_file()
     ranked = rank_photographs(dataset.train, render, dataset.background)
     first_frame = Image.open(io.BytesIO(orbit)).convert("RGB")

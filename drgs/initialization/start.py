@@ -330,9 +330,8 @@ def colors_from_images(
     hide each other, so that images count that look onto it. The middle half of a point's colours is
     averaged: the rest may be highlights or occluders.
 
-    points: (N, 3) world; spacing: (N,) scene units, of each to its neighbours; background: of
-    the composited images, display space. A point that no image shows gets the colour of the nearest
-    point that is shown.
+    points: (N, 3) world; spacing: (N,) scene units, of each to its neighbours; background: of the
+    composited images, display space. Unshown points get the colour of the nearest shown one.
     """
     views = [view for view in views if is_projectable(view)]
     most = max(MIN_COLOR_VIEWS, min(MAX_COLOR_VIEWS, MAX_COLOR_BYTES // (12 * len(points))))

@@ -28,8 +28,7 @@ MIN_POINT_ALPHA = 0.5  # of pixels that show points; fainter parts are found as 
 MIN_TRANSPARENT_SHARE = 0.02  # of an image with a mask; corners emptied by undistortion have less
 
 MIN_MASKED_SHARE, MIN_MASKED_VIEWS = 0.95, 3
-"""Share and number of the views that must have a mask. With fewer, a hull is mostly the cones that
-they see."""
+"""Share and number of the views that must have a mask. With fewer, a hull is mostly their cones."""
 
 MAX_VIEWS, MAX_SIDE_PX = 120, 512
 """Number of silhouettes, and their longest side: pixels of larger images are merged."""
@@ -138,8 +137,7 @@ class Cubes:
     def divide(self) -> Cubes:
         """Return eight cubes in the place of each."""
         eighths = np.argwhere(np.ones((2, 2, 2), bool))
-        index = (2 * self.index[:, None] + eighths).reshape(-1, 3)
-        return Cubes(self.low, self.edge / 2, index)
+        return Cubes(self.low, self.edge / 2, (2 * self.index[:, None] + eighths).reshape(-1, 3))
 
     def select(self, rows: np.ndarray) -> Cubes:
         """Return some of the cubes; rows: a mask or indices."""

@@ -176,8 +176,7 @@ class SceneRenderer:
             window=mi.load_dict(part),
         )
         if view.nested is not None:
-            count = view.num_surfaces(view.nested)
-            view = replace(view, nested=view.nested.with_surfaces(count))
+            view = replace(view, nested=view.nested.with_surfaces(view.num_surfaces(view.nested)))
         (channels,) = view.channels(view.planes(), constant_background(splats))
         cache.forget("frames")
         color, own = mi.Color3f(channels[:3]), channels[3:]

@@ -187,7 +187,7 @@ class DrawnSamples(CenterSamples):
         seed = seed if isinstance(seed, (int, np.integer)) else int(seed[0])
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(spp)
-        spp = sampler.sample_count()  # some round it up
+        self.spp = spp = sampler.sample_count()  # some round it up
         num_pixels = int(dr.prod(self.film.crop_size()))
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, num_pixels * spp)
@@ -199,13 +199,12 @@ class DrawnSamples(CenterSamples):
     def develop(self, passes: Sequence[Channels]) -> mi.TensorXf:
         film = self.film
         if film.rfilter().is_box_filter():
-            count = sum(point.samples for point in self.points)
             sums = [mi.Float(0)] * len(passes[0])
             for number, channels in enumerate(split_samples(self.points, passes), 1):
                 sums = [total + plane for total, plane in zip(sums, channels, strict=True)]
-                if number % SAMPLES_PER_KERNEL == 0 and number < count:
+                if number % SAMPLES_PER_KERNEL == 0 and number < self.spp:
                     dr.eval(sums)
-            return develop_pixels(film, [total / count for total in sums], self.aovs)
+            return develop_pixels(film, [total / self.spp for total in sums], self.aovs)
         film.prepare(self.aovs)
         block = film.create_block()
         for point, channels in zip(self.points, passes, strict=True):
@@ -219,9 +218,8 @@ class DrawnSamples(CenterSamples):
     @override
     def adjoint(self, grad_in: mi.TensorXf) -> list[Channels]:
         if self.film.rfilter().is_box_filter():
-            count = sum(point.samples for point in self.points)
             averaged = pixels_adjoint(self.film, self.maps, grad_in, self.aovs)
-            of_sample = [d / count for d in averaged]
+            of_sample = [d / self.spp for d in averaged]
             dr.eval(of_sample)
             return [[repeat_array(d, point.samples) for d in of_sample] for point in self.points]
         # The image is linear in the channels: their values do not matter.
@@ -310,12 +308,8 @@ def background_radiance(
     cameras: Sequence[Camera],
     offsets: Sequence[tuple[mi.Float | float, mi.Float | float]],
 ) -> list[list[mi.Color3f]]:
-    """Return the background at all pixels, by time and by pass.
-
-    cameras: by time; offsets: by pass, x and y from the pixel's upper left corner, px.
-    """
+    """Return backgrounds by time (cameras) and pass; offsets: from pixels' upper left, in px."""
     places = [pixel_corners(film, num_samples(film, x)) + mi.Vector2f(x, y) for x, y in offsets]
     if isinstance(background, mi.Texture):
-        found = [stretched_radiance(background, film, place) for place in places]
-        return [found] * len(cameras)
+        return [[stretched_radiance(background, film, place) for place in places]] * len(cameras)
     return [[environment_radiance(background, camera, p) for p in places] for camera in cameras]

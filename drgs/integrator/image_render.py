@@ -301,10 +301,9 @@ class SensorRender:
         layers = repeat(repeat(None))
         if self.nested is not None:
             layers = self._traced_surfaces(self.nested).value
-        by_time = zip(planes, layers, behind.colors, behind.radiance, strict=False)
         channels = [
             [self._channels_of(behind, *sample) for sample in zip(*time, strict=False)]
-            for time in by_time
+            for time in zip(planes, layers, behind.colors, behind.radiance, strict=False)
         ]
         return channels[0] if len(channels) == 1 else _mean(channels)
 
@@ -417,10 +416,7 @@ class SensorRender:
         surfaces: Sequence[SurfaceLayers] | None,
         splats: SplatTable | None,
     ) -> list[rendering.Frame]:
-        """Render a frame for each pass.
-
-        surfaces: the visible ones, by pass; splats: of the Gaussians, if projected beforehand.
-        """
+        """Render a frame for each pass; surfaces: by pass; splats: if projected beforehand."""
         pipeline = with_effects(pipeline, gaussians, camera)
         models = [replace(pipeline.model, positions=points) for points in self.positions]
         if surfaces is not None:
@@ -442,10 +438,9 @@ class SensorRender:
 
         state = self._camera_state
         hides, (_, far) = self.splats.hide_emitters, depth_range(self.sensor)
-        settings = nested.surfaces, self.key, hides, far, *state.settings
         return self.splats.cache.find(
             f"surfaces {self.index}",
-            settings,
+            (nested.surfaces, self.key, hides, far, *state.settings),
             state.device,
             lambda: trace_surfaces(
                 nested.rays,

@@ -1,9 +1,8 @@
 """Gaussians of an image from several parts: splat objects and shapes.
 
-Imported when a scene has more than the unmoved Gaussians of one integrator. Each :data:`Part`
-converts stored Gaussians to raw parameters in world space; Dr.Jit differentiates the conversions.
-Columns are gathered and interleaved as permutations, without atomic additions: derivatives are the
-same bytes in every run.
+Imported when a scene has more than one integrator's unmoved Gaussians. Each :data:`Part` converts
+stored Gaussians to raw parameters in world space; Dr.Jit differentiates the conversions. Columns
+are gathered and interleaved as permutations, without atomic additions: results are reproducible.
 
 A :class:`Placement` moves the Gaussians of an object by a ``to_world`` x' = k R x + t:
 
@@ -181,8 +180,7 @@ def columns(flat: Float, width: int) -> list[Float]:
     """Return the columns of rows of ``width`` numbers; see :func:`interleave_columns`."""
     if width == 0:
         return []
-    UInt32 = types_of(type(flat)).UInt32
-    row = dr.arange(UInt32, dr.width(flat) // width) * width
+    row = dr.arange(types_of(type(flat)).UInt32, dr.width(flat) // width) * width
     return [dr.gather(type(flat), flat, row + k, mode=dr.ReduceMode.Permute) for k in range(width)]
 
 

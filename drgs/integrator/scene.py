@@ -98,7 +98,14 @@ def _sensor(view: Viewpoint, calibrated: bool) -> dict[str, object]:
     }
     is_perspective = view.lens is None and view.motion is None and _has_square_pixels(view)
     if is_perspective and not calibrated:
-        return pose | _perspective(view)
+        focal = math.sqrt(view.fx * view.fy)
+        return pose | {
+            "type": "perspective",
+            "fov": math.degrees(2 * math.atan(0.5 * view.width / focal)),
+            "fov_axis": "x",
+            "principal_point_offset_x": 0.5 - view.cx / view.width,
+            "principal_point_offset_y": 0.5 - view.cy / view.height,
+        }
     intrinsics = {name: getattr(view, name) for name in ("fx", "fy", "cx", "cy")}
     if view.lens is not None:
         intrinsics = {} if view.lens.whole_turn else intrinsics
@@ -112,17 +119,6 @@ def _sensor(view: Viewpoint, calibrated: bool) -> dict[str, object]:
 
 def _to_world(camera_to_world: np.ndarray) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f(camera_to_world @ OPENCV_TO_MITSUBA)
-
-
-def _perspective(view: Viewpoint) -> dict[str, object]:
-    focal = math.sqrt(view.fx * view.fy)
-    return {
-        "type": "perspective",
-        "fov": math.degrees(2 * math.atan(0.5 * view.width / focal)),
-        "fov_axis": "x",
-        "principal_point_offset_x": 0.5 - view.cx / view.width,
-        "principal_point_offset_y": 0.5 - view.cy / view.height,
-    }
 
 
 def _has_square_pixels(view: Viewpoint) -> bool:

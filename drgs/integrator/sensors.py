@@ -134,8 +134,7 @@ def camera_from_sensor(state: SensorState) -> Camera:
 
 def accumulate_in_sensor(cameras: Sequence[Camera], gradients: list[list[Float]]) -> None:
     """Accumulate derivatives by ``Camera.numbers()``, by time; see :func:`attached_cameras`."""
-    numbers = chain(*(camera.numbers() for camera in cameras))
-    pairs = zip(numbers, chain(*gradients), strict=True)
+    pairs = zip(chain(*(camera.numbers() for camera in cameras)), chain(*gradients), strict=True)
     attached = [(value, gradient) for value, gradient in pairs if dr.grad_enabled(value)]
     for value, gradient in attached:
         dr.accum_grad(value, gradient)
@@ -199,10 +198,7 @@ def opaque_host(state: SensorState) -> list[Float]:
 def on_crop_window(
     state: SensorState, host: list[Float], to_world: Matrix4f, focal: Pair, principal: Pair
 ) -> Camera:
-    """Create the camera of a film's crop window.
-
-    to_world: 4 x 4, from Mitsuba's camera axes; focal, principal: px of the whole film.
-    """
+    """Create a crop window's camera; to_world: Mitsuba's; focal, principal: the whole film's px."""
     width, height, crop_x, crop_y, *_, near = host
     *_, crop_width, crop_height, _ = state.host
     t = types_of(type(near))
@@ -228,8 +224,7 @@ def pose_from_to_world(to_world: Matrix4f) -> tuple[Matrix3f, Array3f]:
     """
     right, down, forward, center = _columns(to_world)
     t = types_of(type(center.x))
-    axes = [list(dr.normalize(axis)) for axis in (-right, -down, forward)]
-    return t.Matrix3f(axes), center
+    return t.Matrix3f([list(dr.normalize(axis)) for axis in (-right, -down, forward)]), center
 
 
 def axis_lengths(to_world: Matrix4f) -> list[Float]:

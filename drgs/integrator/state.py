@@ -488,10 +488,6 @@ if TYPE_CHECKING:
         last: BackwardResult  # after a backward pass
         projected_view: ProjectedView | None
 
-        def forget_frames(self) -> None:
-            """Clear the cached frames."""
-            ...
-
         def summary(self, scene: mi.Scene, *sensors: mi.Sensor) -> str:
             """Return a summary of the simulated effects."""
             ...

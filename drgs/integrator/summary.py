@@ -84,9 +84,8 @@ def summary_of_views(
     splats: SplatsState, views: Sequence[Viewpoint], from_header: Collection[str] = ()
 ) -> list[SimulatedEffect]:
     """Return the effects for views; from_header: approximations that the file's header sets."""
-    count = f"{len(views)} cameras"
     of_cameras = [
-        effect_of(views, count).unless_ignored(word in splats.ignore)
+        effect_of(views, f"{len(views)} cameras").unless_ignored(word in splats.ignore)
         for effect_of, word in ((lens_effect, "distortion"), (motion_effect, "motion"))
     ]
     return _summary_of_integrator(splats, None, of_cameras, from_header)

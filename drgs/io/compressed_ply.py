@@ -11,8 +11,7 @@ and the largest position, logarithm of scale and base colour of each group; in t
   others in 10 bits each, from -1/sqrt(2) to 1/sqrt(2).
 
 The element ``sh`` has the harmonics above degree 0, in the order of the 3DGS reference, in steps of
-1/32 from -4 to 4; larger values are clamped. The header's comments are those of
-:mod:`drgs.io.ply`.
+1/32 from -4 to 4; others are clamped. Comments are those of :mod:`drgs.io.ply`.
 """
 
 from __future__ import annotations
@@ -73,10 +72,7 @@ class CompressedPly(FileFormat):
 
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
-        """Return Gaussians, and the values in the header's comments.
-
-        Files without bounds of colours, as older programs write them, are read as well.
-        """
+        """Return Gaussians and header values, also of older files without bounds of colours."""
         rows, statements = read_elements(path, ["chunk", "vertex", "sh"])
         vertex, chunk, sh = rows["vertex"], rows["chunk"], rows.get("sh")
         harmonics = 1 if sh is None else 1 + len(sh.dtype.names or ()) // 3

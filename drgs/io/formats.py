@@ -104,7 +104,7 @@ class FileFormat:
         return cls.metadata is None or name in cls.metadata
 
 
-FORMATS: Registry[type[FileFormat]] = Registry("file format", "drgs.formats")
+FORMATS: Registry[type[FileFormat]] = Registry("file format", "drgs.formats", unique="suffix")
 
 
 def readable_formats() -> list[Extension[type[FileFormat]]]:

@@ -1,8 +1,7 @@
 """Binary glTF 2.0 with ``KHR_gaussian_splatting``: Gaussians as a point primitive, in float32.
 
 Source of the layout: "glTF 2.0 Specification" (Khronos), section 4.4, and the ratified extension
-``KHR_gaussian_splatting`` with its kernel ``ellipse``. Attributes of the primitive, all in axes
-with y up:
+``KHR_gaussian_splatting`` with its kernel ``ellipse``. Attributes, in axes with y up:
 
 - ``POSITION``, and ``COLOR_0`` (base colour and opacity) for programs that show points;
 - ``KHR_gaussian_splatting:ROTATION``, a unit quaternion xyzw; ``:SCALE``, standard deviations,
@@ -10,8 +9,7 @@ with y up:
 - ``:SH_DEGREE_l_COEF_n``, the harmonics in the order and with the signs of the 3DGS reference.
 
 Colours are in display space, ``srgb_rec709_display``. Rendering settings are in the primitive's
-``extras``, which other programs ignore. Keys of the JSON part that are not
-named here are ignored.
+``extras``, which other programs ignore. Other keys of the JSON part are ignored.
 """
 
 from __future__ import annotations
@@ -118,8 +116,7 @@ class Glb(FileFormat):
         if origin != WORLD:  # exactly the file's
             moved = means
             settings = settings | dict(zip(ORIGIN, document.translation, strict=True))
-        arrays = arrays_from_activated(moved, quats, scales, opacities[:, 0], harmonics)
-        return arrays, settings
+        return arrays_from_activated(moved, quats, scales, opacities[:, 0], harmonics), settings
 
     @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
@@ -375,8 +372,7 @@ def _read_document(path: Path, text: bytes, binary: bytes) -> _Document:
     missing = [name for name in REQUIRED if name not in primitive.attributes]
     if missing:
         raise UserError(f"{path}: {place}: attributes {', '.join(missing)} are missing")
-    translation = _translation(path, file.nodes, mesh)
-    return _Document(path, place, primitive, file, translation, binary)
+    return _Document(path, place, primitive, file, _translation(path, file.nodes, mesh), binary)
 
 
 def _translation(path: Path, nodes: list[_Node], mesh: int) -> tuple[float, float, float]:

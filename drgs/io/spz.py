@@ -126,11 +126,7 @@ class Spz(FileFormat):
 
     @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-        """Return a file of version 3.
-
-        Raises :class:`UserError` where most Gaussians are smaller or larger than scales can be; a
-        :class:`UserNote` reports fewer.
-        """
+        """Return a file, version 3; UserError if most scales are out of range, else a UserNote."""
         g = gaussians
         _check_scales(g["log_scales"])
         num, degree = len(g["means"]), round(np.sqrt(g["shN"].shape[1] + 1)) - 1
@@ -273,8 +269,7 @@ def _read_gzip(path: Path, content: bytes) -> tuple[_Header, list[bytes]]:
                 raise UserError(f"{place}: the gzip stream is damaged: {one_line(error)}") from None
             return _checked_size(place, data, least)
 
-        fields = HEADER.unpack(take(HEADER.size, HEADER.size))
-        header = _checked_header(path, fields[:6], (2, 3))
+        header = _checked_header(path, HEADER.unpack(take(HEADER.size, HEADER.size))[:6], (2, 3))
         parts = [take(size, size) for size in header.sizes]
         while take(1 << 16, 0):  # to the end, where the checksum is
             if not header.flags & EXTENSIONS:

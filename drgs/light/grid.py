@@ -208,8 +208,7 @@ class _Boxes:
         """Return rows and cells of a level's entries, in the order of the rows."""
         t = types_of(type(self.ellipsoids.centers.x))
         first, number = self._ranges(level, resolution)
-        counts = dr.prod(number)
-        row, local = _expand(counts)
+        row, local = _expand(dr.prod(number))
         if dr.width(row) == 0:
             return t.UInt32(), t.UInt32()
         nx, ny = (dr.gather(t.UInt32, number[k], row) for k in (0, 1))

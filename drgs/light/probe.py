@@ -280,8 +280,7 @@ def _face(
     K = np.array(
         [[CUBE_SIZE_TEXELS / 2, 0, edge / 2], [0, CUBE_SIZE_TEXELS / 2, edge / 2], [0, 0, 1]]
     )
-    rotation = np.stack([right, down, forward])
-    camera = Camera.create(Float, rotation, center, K, edge, edge, near)
+    camera = Camera.create(Float, np.stack([right, down, forward]), center, K, edge, edge, near)
     T, *color, depth = rendering.render(gaussians, camera, pipeline).planes()
     coverage = 1 - T
     shows = coverage > 0

@@ -1,8 +1,7 @@
 """Splats along rays: their radiance, and their transmittance.
 
-A ray o + t d, with d of unit length, meets a Gaussian at its peak (Moenne-Loccoz et al. 2024, "3D
-Gaussian Ray Tracing", section 4): with o' = W (o - m) and d' = W d in the coordinates in which it
-is the unit Gaussian,
+A ray o + t d, |d| = 1, meets a Gaussian at its peak (Moenne-Loccoz et al. 2024, "3D Gaussian Ray
+Tracing", section 4): with o' = W (o - m) and d' = W d in coordinates of the unit Gaussian,
 
     t = -(o' . d') / |d'|^2,   alpha = min(alpha_max, opacity exp(-|o' + t d'|^2 / 2)).
 
@@ -64,8 +63,7 @@ class RaySplats:
     def from_gaussians(rows: GaussianRows, sh_degree: int, cutoffs: Cutoffs) -> RaySplats:
         """Copy the Gaussians and sort them into a grid. The host waits for the device.
 
-        rows: detached. Rows that are not finite, or reach beyond :data:`MAX_DISTANCE`, are left
-        out.
+        rows: detached; those not finite, or beyond :data:`MAX_DISTANCE`, are left out.
         """
         t = types_of(type(rows.logit_opacities))
         rotation, scales = quat_to_rotation(rows.quats), dr.exp(rows.log_scales)
@@ -182,8 +180,7 @@ class RaySplats:
         for _ in range(count - 1):
             powers = dr.fma(powers, coverage, 1)
         T = dr.select(_farthest(draws) < dr.inf, 0, 1 / powers)
-        exist = [one.is_stopped for one in draws]
-        return [t.Array3f(color) for color in found], exist, T
+        return [t.Array3f(color) for color in found], [one.is_stopped for one in draws], T
 
     def _color(self, row: UInt32, basis: list[Scalar], active: Bool) -> list[Float]:
         t = types_of(self.shapes.Float)
@@ -287,8 +284,7 @@ class _Walk:
         peak, log2_alpha = self.meet(row, True)
         here = (peak >= at.start) & (peak < at.end) & (peak > 0) & (peak < self.stop)
         log2_alpha = dr.select(here, log2_alpha, -dr.inf)
-        behind = replace(at, entry=at.entry + 1, turn=at.turn + 1)
-        return behind, row, peak, log2_alpha
+        return replace(at, entry=at.entry + 1, turn=at.turn + 1), row, peak, log2_alpha
 
     def meet(self, row: UInt32, active: Bool | bool) -> tuple[Float, Float]:
         """Return the peak of a Gaussian on a ray, and log2 of its alpha, -inf outside."""
@@ -453,10 +449,7 @@ def _farthest(draws: list[_Draw]) -> Float:
 
 
 def _hashes(row: UInt32, seed: UInt32, count: int) -> list[UInt32]:
-    """Return random numbers of a Gaussian and a ray, by PCG's output function (O'Neill 2014).
-
-    Each hash gives two numbers: itself, and itself with its halves exchanged.
-    """
+    """Return random words by PCG's output function (O'Neill 2014), and with halves exchanged."""
     UInt32 = type(row)
     numbers, state = [], row ^ seed
     for _ in range(-(-count // 2)):

@@ -173,8 +173,7 @@ def _normals(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
 def _error(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     image, seconds = scene.image(request)
     given = request.approximations or scene.approximations
-    projection = VIEWER_LENSES[request.lens].most_accurate
-    best = replace(given, projection=projection, **MOST_ACCURATE)
+    best = replace(given, projection=VIEWER_LENSES[request.lens].most_accurate, **MOST_ACCURATE)
     accurate, accurate_seconds = scene.image(replace(request, approximations=best))
     quality = psnr(image, accurate)
     comparison = "the same as" if math.isinf(quality) else f"PSNR {quality:.1f} dB to"
@@ -264,10 +263,9 @@ def _mitsuba_sensor(
     camera: ViewerCamera, width: int, height: int, scale: np.ndarray, **settings: object
 ) -> mi.Sensor:
     """scale: (4, 4), of the sensor's axes."""
-    to_world = camera.camera_to_world @ OPENCV_TO_MITSUBA @ scale
     return mi.load_dict(
         {
-            "to_world": mi.ScalarTransform4f(to_world),
+            "to_world": mi.ScalarTransform4f(camera.camera_to_world @ OPENCV_TO_MITSUBA @ scale),
             "near_clip": NEAR_CLIP,
             "sampler": {"type": "independent", "sample_count": 1},
             "film": film_description(width, height),

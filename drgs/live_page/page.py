@@ -85,8 +85,7 @@ class StartView:
             target = first.center if middle is None else middle
         distance = float((target - first.center) @ first.camera_to_world[:3, 2])
         if not distance > 0:
-            spread = np.ptp([view.center for view in views], axis=0).max()
-            distance = float(spread) or 1.0
+            distance = float(np.ptp([view.center for view in views], axis=0).max()) or 1.0
         fov = 2 * math.degrees(math.atan(0.5 * first.height / first.fy))
         return StartView(ViewerCamera(first.camera_to_world, fov, distance), up_of(views))
 
@@ -97,10 +96,7 @@ class StartView:
         return replace(self, camera=ViewerCamera(pose, camera.fov, factor * camera.distance))
 
     def upright(self, up: np.ndarray) -> StartView:
-        """Return the view with another up direction; up: (3,) world, any length.
-
-        Raises :class:`UserError` if it is zero or along the camera's axis.
-        """
+        """Return the view turned to ``up`` (3,), world; UserError if zero or along the axis."""
         camera, position = self.camera, self.camera.camera_to_world[:3, 3]
         pose = look_at(position, position + camera.distance * camera.camera_to_world[:3, 2], up)
         return StartView(replace(camera, camera_to_world=pose), up / np.linalg.norm(up))
@@ -153,10 +149,7 @@ class CameraControls:
         return min(2 * math.atan(half), math.radians(MAX_FOV))
 
     def request(self, camera: viser.CameraHandle) -> FrameRequest:
-        """Return the request for a client's camera with the values of all controls.
-
-        Raises ValueError for an approximation outside its limits.
-        """
+        """Return the request for a client's camera and controls; ValueError beyond their limits."""
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
         pose[:3, 3] = camera.position

@@ -29,10 +29,7 @@ class PendingRequest:
 
 
 class RenderRequests:
-    """Render requests from viewer clients, queued by server threads for the render thread.
-
-    Clients also pause and end a fit here. Any thread may call any method.
-    """
+    """Requests of viewer clients, by any thread for the render thread; also to pause and end."""
 
     def __init__(self) -> None:
         self._pending: dict[int, PendingRequest] = {}

@@ -41,10 +41,7 @@ class LocalServer(viser.ViserServer):
 
 @contextmanager
 def run_server(port: int | None, option: str) -> Iterator[LocalServer]:
-    """Run a server with an empty page within the block.
-
-    port: None for the first free one from 8080 on; option: its name on the command line.
-    """
+    """Serve an empty page within the block; port: None: first free from 8080; option: its name."""
     if port is not None:
         _check_free(port, option)
     # They log a traceback, or thousands of lines, for a browser that leaves while it is served.

@@ -87,8 +87,7 @@ class ImageModel:
 
     stop: a pixel is finished ``"before"`` the splat that takes its transmittance below
     transmittance_stop, which is then not composited, or ``"after"`` it. step: of order ``"entry"``;
-    a ray that has entered a splat goes on so far behind the entry, and passes over what it enters
-    on the way.
+    a ray that has entered a splat goes on so far behind the entry, passing over what it enters.
 
     Raises ValueError for unknown choices and numbers out of range.
     """
@@ -227,8 +226,7 @@ def render_along(
         total = axes @ np.swapaxes(axes, 1, 2) + widening
         whitening = np.linalg.inv(np.linalg.cholesky(total))
     else:
-        scales = np.exp(gaussians.log_scales)[:, :, None]
-        whitening = np.swapaxes(rotations, 1, 2) / scales
+        whitening = np.swapaxes(rotations, 1, 2) / np.exp(gaussians.log_scales)[:, :, None]
     rows = whitening.reshape(-1, 3).T
     start = np.nan_to_num(origins).reshape(-1, 3)
     means = np.einsum("nij,nj->ni", whitening, gaussians.means - start[0])

@@ -159,10 +159,7 @@ class RenderedImage:
 
 
 def quat_to_rotation(quats: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices (N, 3, 3) of quaternions (N, 4), wxyz, of any norm.
-
-    A quaternion of norm zero gives the identity.
-    """
+    """Return rotations (N, 3, 3) of quaternions (N, 4) wxyz of any norm; of zero, the identity."""
     unit_quats, _ = _normalize(quats, fallback=(1.0, 0.0, 0.0, 0.0))
     w, x, y, z = unit_quats.T
     return _rows_of_matrices(
@@ -207,8 +204,7 @@ C_33 = np.sqrt(35 / (32 * np.pi))
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """Return the real spherical harmonics (N, K) of unit directions (N, 3), K = (degree + 1)^2.
 
-    Column l^2 + l + m holds degree l, order m, with the signs of 3DGS. They are orthonormal on
-    the sphere.
+    Column l^2 + l + m: degree l, order m, with the signs of 3DGS; orthonormal on the sphere.
     """
     x, y, z = directions.T
     basis = [
@@ -264,8 +260,7 @@ def sh_colors(gaussians: Gaussians, camera: Camera, degree: int | None = None) -
     """Return the colours (N, 3) that the camera sees, display space, >= 0, not bounded above.
 
     color = max(0, sum_k Y_k(direction) coefficient_k + 0.5), with the direction from the camera's
-    centre to the mean (3DGS rasterizer). ``degree`` may be lower than what is stored, which is
-    the default.
+    centre to the mean (3DGS rasterizer). ``degree`` may be below the stored one, the default.
     """
     directions, _ = _view_directions(gaussians, camera)
     return np.maximum(unclamped_colors(gaussians, directions, degree), 0.0)
@@ -279,10 +274,7 @@ def _view_directions(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, 
 def unclamped_colors(
     gaussians: Gaussians, directions: np.ndarray, degree: int | None = None
 ) -> np.ndarray:
-    """Return colours (N, 3) before they are clamped at zero.
-
-    directions: unit, world, (N, 3) or, for all Gaussians, (1, 3).
-    """
+    """Return colours (N, 3) before clamping at zero; directions: unit, world, (N, 3) or (1, 3)."""
     degree = gaussians.sh_degree if degree is None else degree
     colors = sh_basis(directions, degree)[..., None] * gaussians.sh[:, : (degree + 1) ** 2]
     return np.sum(colors, axis=1) + 0.5
@@ -295,8 +287,7 @@ def unclamped_colors(
 class LocalAffine:
     """The affine approximation of the projection at each mean, with its intermediate results.
 
-    Rows behind the near plane have their camera mean replaced by (0, 0, 1), so that no division
-    meets a zero.
+    Rows behind the near plane have the camera mean (0, 0, 1): no division meets a zero.
     """
 
     in_front: np.ndarray  # (N,) bool: camera z >= near
@@ -364,12 +355,11 @@ def project(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
     opacities = sigmoid(gaussians.logit_opacities)
     if antialiased:
         opacities = opacities * areas / np.sqrt(dets)
-    depths = (gaussians.means - camera.center) @ camera.rotation[2]
     return Projection(
         means2d=camera.film_points(affine.means),
         cov2d=cov2d,
         conics=_inverses(cov2d, dets),
-        depths=depths,
+        depths=(gaussians.means - camera.center) @ camera.rotation[2],
         opacities=opacities,
         visible=affine.in_front & (opacities > ALPHA_CUT),
     )
@@ -480,8 +470,7 @@ def composite(
     before the pixel is finished, is that close to the cut or (before clamping) to the clamp, or the
     transmittance behind a splat is that close to the stop.
 
-    period: px along x after which a splat is seen again, of which a pixel has the nearest; None:
-    never.
+    period: px along x after which splats recur, of which a pixel has the nearest; None: never.
     """
     order = depth_order(splats.depths, splats.visible)
     centers, cuts = pixel_centers(width, height), splats.all_cuts
@@ -582,12 +571,10 @@ def composite_gradients(
     centers, cuts = pixel_centers(width, height), splats.all_cuts
     boxes = _pixel_boxes(splats, order, width, height)
 
-    d_means2d = np.zeros_like(splats.means2d)
-    d_conics = np.zeros_like(splats.conics)
-    d_opacities = np.zeros_like(splats.opacities)
-    d_colors = np.zeros_like(colors)
-    d_depths = np.zeros_like(splats.depths)
-    d_background = np.einsum("hw,hwc->c", rendered.transmittance, d_image)
+    of_splats = ("means2d", "conics", "opacities", "depths")
+    gradients = {name: np.zeros_like(getattr(splats, name)) for name in of_splats}
+    gradients["colors"] = np.zeros_like(colors)
+    gradients["background"] = np.einsum("hw,hwc->c", rendered.transmittance, d_image)
 
     transmittance = rendered.transmittance.copy()
     suffix_sum = transmittance * (d_image @ np.asarray(background))
@@ -604,27 +591,20 @@ def composite_gradients(
         d_splat_alpha = transmittance[box] * value - suffix_sum[box] / (1 - alpha)
         suffix_sum[box] += weight * value
 
-        d_colors[i] = np.einsum("hw,hwc->c", weight, d_image[box])
-        d_depths[i] = np.sum(weight * d_depth[box])
+        gradients["colors"][i] = np.einsum("hw,hwc->c", weight, d_image[box])
+        gradients["depths"][i] = np.sum(weight * d_depth[box])
 
         # alpha = o G(d) where it is neither cut nor clamped, G = exp(p), p = -d^T A d / 2.
         differentiable = contributes & (splat.raw_alpha < ALPHA_MAX)
         d_splat_alpha = np.where(differentiable, d_splat_alpha, 0.0)
-        d_opacities[i] = np.sum(d_splat_alpha * splat.falloff)
+        gradients["opacities"][i] = np.sum(d_splat_alpha * splat.falloff)
         d_power = d_splat_alpha * alpha
 
         # dp/dA = -d d^T / 2 and, since d = pixel - mean2d, dp/dmean2d = A d.
         weighted = d_power[..., None] * splat.offsets
-        d_means2d[i] = splats.conics[i] @ np.sum(weighted, axis=(0, 1))
-        d_conics[i] = -0.5 * np.einsum("hwi,hwj->ij", weighted, splat.offsets)
-    return {
-        "means2d": d_means2d,
-        "conics": d_conics,
-        "opacities": d_opacities,
-        "colors": d_colors,
-        "depths": d_depths,
-        "background": d_background,
-    }
+        gradients["means2d"][i] = splats.conics[i] @ np.sum(weighted, axis=(0, 1))
+        gradients["conics"][i] = -0.5 * np.einsum("hwi,hwj->ij", weighted, splat.offsets)
+    return gradients
 
 
 def project_gradients(
@@ -633,8 +613,7 @@ def project_gradients(
     """Return the gradients with respect to means, quats, log_scales and logit_opacities.
 
     d_splats: from ``composite_gradients``. Rows that are not visible get zero, and so does a
-    quaternion of norm zero. Where a ratio of the Jacobian is clamped, it is a constant, and J still
-    depends on z.
+    quaternion of norm zero. A clamped ratio of the Jacobian is a constant; J still depends on z.
 
     Not differentiated: the camera.
     """
@@ -794,8 +773,7 @@ def render_gradients(
 def _normalize(vectors: np.ndarray, fallback: tuple) -> tuple[np.ndarray, np.ndarray]:
     """Return v / |v| (N, D) and |v| (N,).
 
-    A zero vector becomes ``fallback``, and its norm is given as infinite: ``_normalize_gradients``
-    then returns zero for it.
+    A zero vector becomes ``fallback``, of infinite norm: ``_normalize_gradients`` is zero for it.
     """
     norms = np.linalg.norm(vectors, axis=-1)
     norms = np.where(norms == 0, np.inf, norms)

@@ -5,8 +5,7 @@
 load Python plugins). Cameras of Gaussians are the photographs' (``--split``, with metrics), an
 orbit (``--orbit``), a file's (``--camera``) or one (``--origin``).
 
-Writes a PNG per image, and ``metrics.json`` (``--split``) or ``orbit.webp`` (``--orbit``), or an
-EXR per image (scenes).
+Writes PNGs, with ``metrics.json`` (``--split``) or ``orbit.webp`` (``--orbit``); of scenes, EXRs.
 """
 
 from __future__ import annotations

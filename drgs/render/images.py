@@ -88,8 +88,7 @@ def render_orbit(model: Model, args: argparse.Namespace, folder: ImageFolder) ->
     viewpoints = orbit.viewpoints(args.orbit, width, height, fov)
     if args.panorama:
         viewpoints = [panorama(view, orbit.up) for view in viewpoints]
-    images = render_cameras(model, viewpoints, folder, [ORBIT])
-    write_animation(folder.path / ORBIT, images)
+    write_animation(folder.path / ORBIT, render_cameras(model, viewpoints, folder, [ORBIT]))
 
 
 def _orbited_views(

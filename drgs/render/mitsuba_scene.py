@@ -23,8 +23,7 @@ def render_mitsuba_scene(
 ) -> None:
     """Render every sensor of a Mitsuba scene to EXR (all channels) and PNG (colours in sRGB).
 
-    definitions: values for the parameters ($name) of the scene file; budget: of the error, instead
-    of the scene's own.
+    definitions: of the scene file's parameters ($name); budget: of the error, for the scene's own.
     """
     try:
         scene = load_scene_file(path, **definitions)
@@ -43,6 +42,9 @@ def render_mitsuba_scene(
     files = [f"{name}.{suffix}" for name in names for suffix in ("exr", "png")]
     files += [ERROR_BUDGET] if splats is not None and splats.error is not None else []
     bitmaps = folder.claim(files, _render_sensors(path, scene))
+    # Nested integrators, such as ``volprim_rf_basic``, may encode colours.
+    nested = mi.traverse(integrator).hierarchy
+    is_linear = all(getattr(each, "srgb_primitives", True) for each in nested)
     for name, bitmap in zip(names, bitmaps, strict=True):
         width, height = bitmap.size()
         if splats is not None and splats.budget_report is not None:
@@ -51,20 +53,12 @@ def render_mitsuba_scene(
         write_exr(folder.path / f"{name}.exr", bitmap)
         # As floats: Mitsuba's own conversion to 8 bits rounds down.
         colors = bitmap.split()[0][1].convert(
-            mi.Bitmap.PixelFormat.RGB,
-            mi.Struct.Type.Float32,
-            srgb_gamma=_is_linear(scene.integrator()),
+            mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=is_linear
         )
         # NaN in a scene's light is black in the PNG, and kept in the EXR.
         folder.write_png(f"{name}.png", np.nan_to_num(np.array(colors)))
         print(f"{name}: {width}x{height}")
     folder.write_budget()
-
-
-def _is_linear(integrator: mi.Integrator) -> bool:
-    """Return whether no nested integrator (``splats``, ``volprim_rf_basic``) encodes colours."""
-    nested = mi.traverse(integrator).hierarchy
-    return all(getattr(each, "srgb_primitives", True) for each in nested)
 
 
 def _render_sensors(path: Path, scene: mi.Scene) -> Iterator[mi.Bitmap]:

@@ -12,10 +12,9 @@ import numpy as np
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.core.errors import UserError
 from drgs.integrator.scene import render_views
+from drgs.results.model import Render
 from drgs.training.parallel.agreement import check_scene
 from drgs.training.parallel.communicator import Communicator, wait
-
-Render = Callable[..., Iterator[np.ndarray]]  # renders images (H, W, 3) of a scene and views
 
 
 def run_together(args: argparse.Namespace, work: Callable[[Render], None]) -> None:

@@ -152,8 +152,7 @@ def _move(image: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def _directions(image: np.ndarray) -> np.ndarray:
     """Return the derivatives of an image (H, W, 3) along the numbers, (7, H, W, 3).
 
-    They are along the shift, zoom, rotation, distortion and skews, of which the rotation has
-    explained a part.
+    They are along shift, zoom, rotation, distortion and skews, part of which the rotation explains.
     """
     x, y = (each[..., None] for each in _coordinates(*image.shape[:2]))
     dy, dx = np.gradient(image, axis=(0, 1))
@@ -167,8 +166,7 @@ def _fit_numbers(directions: np.ndarray, difference: np.ndarray, counts: np.ndar
 
     directions: (K, H, W, 3); difference: (H, W, 3); counts: weights (H, W).
     """
-    # Row by row, products are too small for threads of BLAS, of which each caller's would have its
-    # own.
+    # Row by row, products are too small for BLAS's threads, of which each caller has its own.
     a = directions.reshape(*directions.shape[:2], -1).transpose(1, 0, 2)  # (H, K, 3 W)
     b, given = difference.reshape(len(a), -1), np.repeat(counts, difference.shape[-1], axis=1)
     weights, is_counted = given, given.ravel()[::MEDIAN_STRIDE] > 0

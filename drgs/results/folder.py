@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import yaml
@@ -137,12 +138,10 @@ def write_run_config(folder: Path, config: FitConfig) -> None:
     if _is_unmodified(path):
         dump_config(config, path)
         return
-    try:
-        is_same = load_config(path) == config
-    except UserError:
-        is_same = False
-    if not is_same:
-        note_user(f"{path}: was changed after the fit wrote it, and is kept")
+    with suppress(UserError):
+        if load_config(path) == config:
+            return
+    note_user(f"{path}: was changed after the fit wrote it, and is kept")
 
 
 def require_no_run(folder: Path) -> None:
@@ -181,10 +180,7 @@ def require_results(folder: Path, *names: str) -> None:
 
 
 def load_run_config(folder: Path, overrides: Sequence[str] = ()) -> FitConfig:
-    """Load the configuration of the run in ``folder``; overrides: see :func:`load_config`.
-
-    Raises :class:`UserError` if there is none.
-    """
+    """Load the configuration of the run in ``folder``, with overrides; UserError without one."""
     if not os.path.isfile(folder / CONFIG):
         what = "has no" if os.path.isdir(folder) else "does not exist, and so has no"
         raise UserError(f"{folder}: is not the output folder of a fit: it {what} {CONFIG}")

@@ -63,10 +63,7 @@ class InitialView:
 
     @staticmethod
     def from_views(views: Sequence[Viewpoint], gaussians: Gaussians) -> InitialView:
-        """Return the training camera nearest in direction to the orbit's start.
-
-        gaussians: define the orbit's centre if the cameras do not.
-        """
+        """Return the training camera nearest to the orbit's start; gaussians: as orbit_of_views."""
         orbit = orbit_of_views(views, gaussians)
         level, height = math.cos(orbit.elevation), math.sin(orbit.elevation)
         start = level * orbit.start + height * orbit.up
@@ -189,20 +186,9 @@ def _file_bytes(num_gaussians: int, sh_degree: int) -> int:
 def _scene(
     approximations: Approximations, view: InitialView, background: tuple[float, float, float]
 ) -> Mapping[str, object]:
-    camera, move = view.camera, view.to_page
+    camera, move, off = view.camera, view.to_page, {"enabled": False}
     position = move.scale * move.rotation @ camera.center + move.translation
-    return {
-        "settings": _settings(position, background),
-        "tangents": [camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)],
-        "lowPass": approximations.low_pass,  # square pixels
-        "antialiased": approximations.antialiased,
-    }
-
-
-def _settings(position: np.ndarray, background: tuple[float, float, float]) -> Mapping[str, object]:
-    """Return the viewer's settings, version 2, without the field of view."""
-    off = {"enabled": False}
-    return {
+    settings = {  # of the viewer, without the field of view
         "version": 2,
         "tonemapping": "none",
         "highPrecisionRendering": False,
@@ -218,6 +204,12 @@ def _settings(position: np.ndarray, background: tuple[float, float, float]) -> M
         "cameras": [{"initial": {"position": position.tolist(), "target": [0, 0, 0]}}],
         "annotations": [],
         "startMode": "default",
+    }
+    return {
+        "settings": settings,
+        "tangents": [camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)],
+        "lowPass": approximations.low_pass,  # square pixels
+        "antialiased": approximations.antialiased,
     }
 
 

@@ -101,10 +101,7 @@ def _ssim_map(x: np.ndarray, y: np.ndarray, mask: ArrayLike | None) -> np.ndarra
 def mean_quality(
     pairs: Iterable[tuple[ArrayLike, ArrayLike] | tuple[ArrayLike, ArrayLike, ArrayLike | None]],
 ) -> Quality:
-    """Return unweighted means over views of PSNR and SSIM.
-
-    pairs: (image, target[, mask]) of each view; may be a generator.
-    """
+    """Return unweighted means of PSNR and SSIM over views; pairs: (image, target[, mask]) each."""
 
     def scores(x: ArrayLike, y: ArrayLike, *mask: ArrayLike | None) -> tuple[float, float]:
         return psnr(x, y, *mask), ssim(x, y, *mask)
@@ -113,10 +110,7 @@ def mean_quality(
 
 
 def map_ahead(function: Callable[..., T], items: Iterable[tuple]) -> Iterator[T]:
-    """Yield ``function(*item)`` of all items in order, computed while the next ones are made.
-
-    Few items are in memory at a time.
-    """
+    """Yield ``function(*item)`` in order, computed while the next few items are made."""
     waiting: deque[Future[T]] = deque()
     with ThreadPoolExecutor(NUM_WAITING) as pool:
         for item in items:

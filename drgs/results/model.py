@@ -70,11 +70,7 @@ class ImageFolder:
             write_json(self.path / ERROR_BUDGET, self.budget.record(), indent=2)
 
     def claim(self, names: Iterable[str], images: Iterable[Image]) -> Iterator[Image]:
-        """Yield the images after claiming the files ``names``.
-
-        Raises :class:`UserError` before the first image if one of the files exists and was not
-        rendered.
-        """
+        """Claim files and yield images; UserError before the first if a file was not rendered."""
         names, record = list(names), FolderRecord(self.path, COMMAND)
         record.check(names)
         for index, image in enumerate(images):
@@ -233,8 +229,7 @@ def load_model(
 ) -> Model:
     """Load a file of Gaussians or the output folder of a fit.
 
-    scene: a configuration file; None: the folder's. overrides: KEY=VALUE. background: None: the
-    configuration's, or black.
+    scene: a file, None: the folder's; overrides: KEY=VALUE; background: None: its own, or black.
     """
     path, config_path = what, scene
     if what.is_dir():

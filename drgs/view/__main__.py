@@ -105,8 +105,7 @@ def run(args: argparse.Namespace) -> None:
 
 def background_of(args: argparse.Namespace) -> Background | None:
     """Return the background of the command line; white behind the shipped truck by default."""
-    is_example = args.what == drgs.EXAMPLE
-    return parse_background(args.background or (["white"] if is_example else None))
+    return parse_background(args.background or (["white"] if args.what == drgs.EXAMPLE else None))
 
 
 def cameras_of(args: argparse.Namespace, model: Model) -> Sequence[Viewpoint]:

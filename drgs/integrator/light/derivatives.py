@@ -68,8 +68,7 @@ def check_derivatives(
 ) -> None:
     """Raise UnsupportedError for a parameter whose derivative would be wrong."""
     light, shadows = splats.lighting.light, splats.lighting.shadows
-    is_lit = light != "none" or bool(shadows)
-    parts = splats.attached_parts(scene) if is_lit else []
+    parts = splats.attached_parts(scene) if light != "none" or shadows else []
     if any(dr.grad_enabled(value) for part in parts for value in part.values.values()):
         raise UnsupportedError(
             f"splats: with light '{light}' and shadows '{', '.join(shadows)}', the Gaussians are "
@@ -172,10 +171,9 @@ def _bsdf_refusal(parameter: Parameter, kind: str) -> str | None:
         return "how much of a pixel its surface covers is not; optimise reflectances"
     if own in WRONG_IN_MITSUBA.get(name, ()):
         return f"Mitsuba's derivative of {name} is wrong there; use another BSDF"
-    if parameter.has_nested and _is_mirror(bsdf):
-        is_mixed = _has_flag(bsdf, mi.BSDFFlags.Smooth, mi.BSDFFlags.Null)
-        if name != "BlendBSDF" or is_mixed:
-            return f"{name} is around a perfect mirror or glass; use a rough one"
+    is_mixed = name != "BlendBSDF" or _has_flag(bsdf, mi.BSDFFlags.Smooth, mi.BSDFFlags.Null)
+    if parameter.has_nested and _is_mirror(bsdf) and is_mixed:
+        return f"{name} is around a perfect mirror or glass; use a rough one"
     if kind in REPLAYED_INTEGRATORS and _is_mirror(outer):
         return f"{kind} leaves out what perfect mirrors and glass reflect; {TO_SPLATPATH}"
     if kind in ATTACHED_INTEGRATORS and any(

@@ -281,8 +281,7 @@ def _render_mirror(
     assert isinstance(pipeline.order, PixelOrder), "see _pipeline"
     depths = replace(pipeline.order.depths, bounds=(nearest, farthest))
     order = replace(pipeline.order, depths=depths)
-    frame = rendering.render(gaussians, camera, replace(pipeline, order=order))
-    T, *color = frame.planes()
+    T, *color = rendering.render(gaussians, camera, replace(pipeline, order=order)).planes()
     coverage = 1 - T
     color = mi.Color3f(color) / dr.select(coverage > 0, coverage, 1)
     color = coverage * mi.math.srgb_to_linear(color)

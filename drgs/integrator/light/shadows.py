@@ -79,8 +79,7 @@ class _Estimate:
             points = dr.gather(mi.Point3f, means, shaded)
             directions = dr.gather(mi.Vector3f, normals, shaded)
             lit, dark = self._irradiance(points, directions, self._transmittance)
-            found = dr.select(lit + dark > 0, lit / (lit + dark), 1)
-            dr.scatter(ratio, found, shaded)
+            dr.scatter(ratio, dr.select(lit + dark > 0, lit / (lit + dark), 1), shaded)
         dr.eval(ratio)
         return ratio
 

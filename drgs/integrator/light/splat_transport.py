@@ -5,9 +5,8 @@ C / (1 - T) with the coverage 1 - T. Its radiance is
 
     s (1 - T) lin(C / (1 - T)),
 
-so that opaque splats look the same in a mirror, and a white fog before a white wall stays white.
-with s the ``radiance_scale``. Where a ray leaves a scene that has no environment, black is the last
-splat: s lin(C).
+with s the ``radiance_scale``, so that opaque splats look the same in a mirror, and a white fog
+before a white wall stays white. Rays that leave a scene without environment end in black: s lin(C).
 
 By default, n splats are drawn with their weights instead of compositing all. Their colours c
 estimate the powers of C / (1 - T), without bias: from the sums s_k of c^k,
@@ -93,8 +92,7 @@ class RayTransport(SplatTransport):
             color, coverage = self._composite_sampled(ray, segment.is_open, sample)
         else:
             color, coverage = self._composite_all(ray, segment.is_open)
-        radiance = dr.select(active, self.radiance_scale * color, 0)
-        return radiance, dr.select(active, 1 - coverage, 1)
+        return dr.select(active, self.radiance_scale * color, 0), dr.select(active, 1 - coverage, 1)
 
     def _composite_all(self, segment: Segment, is_open: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
         color, T = self.splats.composite_segment(segment)
@@ -327,12 +325,10 @@ def _mirror_images(
     if not mirrors or surfaces is None:
         return None
     how = splats.approximations, splats.sh_degree
-    settings = (surfaces, *how, *(state.settings for state in states))
-    arrays = gaussians, [state.device for state in states]
     return splats.cache.find(
         "mirrors",
-        settings,
-        arrays,
+        (surfaces, *how, *(state.settings for state in states)),
+        (gaussians, [state.device for state in states]),
         lambda: Mirrors.render(mirrors, states, surfaces.scene_to_trace(scene), gaussians, *how),
     ).value
 
@@ -342,8 +338,7 @@ def _places(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return centres (P, 3) of the objects' probes, and planes (P, 4) beyond which they see.
 
-    The probe of a specular flat mirror is at the first camera's mirror image, close to which its
-    reflected rays pass.
+    A specular flat mirror's probe is at the first camera's mirror image, near which its rays pass.
     """
     centers, planes = np.array(list(map(_center, objects))), np.zeros((len(objects), 4))
     specular = {k: mirror for k, mirror in flat.items() if mirror.is_specular}

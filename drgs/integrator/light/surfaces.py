@@ -265,8 +265,7 @@ class NestedSurfaces:
         surfaces = cache.surfaces = Surfaces.find(scene, cache.surfaces)
         count = splats.nested_spp or spp
         is_lit = splats.lighting.light != "none"
-        # The same paths as ``path``, with correct derivatives for more parameters, and lamps seen
-        # through transparent surfaces.
+        # The paths of ``path``, with more correct derivatives, and lamps seen through surfaces.
         default = {"type": "splatpath", "hide_emitters": hide_emitters}
         nested: mi.SamplingIntegrator = splats.nested or mi.load_dict(default)
         adjoint = nested
@@ -396,10 +395,7 @@ class NestedSurfaces:
 
 @contextmanager
 def _reduce_depth(integrator: Any, count: int) -> Iterator[None]:
-    """Shorten paths by ``count`` bounces where integrators limit them by ``max_depth`` in Python.
-
-    Windows are no bounces for a :class:`TransportIntegrator`.
-    """
+    """Shorten paths by ``count`` bounces, but for TransportIntegrators, where windows are none."""
     depth = getattr(integrator, "max_depth", UNBOUNDED_DEPTH)
     is_bounded = isinstance(depth, int) and depth < UNBOUNDED_DEPTH
     if isinstance(integrator, TransportIntegrator) or not is_bounded:

@@ -110,11 +110,7 @@ class AdaptiveDensityControl(DensityStrategy):
 
     @override
     def update_statistics(self, step: StepInfo) -> None:
-        """Add the gradients of one more view.
-
-        A pixel gradient times (W/2, H/2) is the gradient with respect to normalised device
-        coordinates, the unit of the threshold.
-        """
+        """Add a view's gradients; times (W/2, H/2), they are in NDC units, as the threshold."""
         gradient = step.means2d_grad
         if dr.is_tensor_v(gradient):
             gradient = dr.unravel(types_of(type(gradient.array)).Array2f, gradient.array)
@@ -194,10 +190,7 @@ class AdaptiveDensityControl(DensityStrategy):
         )
 
     def reset_opacities(self, population: Population) -> None:
-        """Lower every opacity to at most ``reset_opacity`` and forget its moments.
-
-        Gaussians that the photographs support regain opacity; floaters are pruned.
-        """
+        """Lower opacities to at most ``reset_opacity``; without moments, floaters stay there."""
         opacity = self.settings.reset_opacity
         ceiling = math.log(opacity / (1 - opacity))
         logits = population.value("logit_opacities")

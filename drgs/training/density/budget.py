@@ -188,10 +188,7 @@ class GrowthToNumber(DensityStrategy):
 
 
 def halves(population: Population, rows: np.ndarray) -> dict[str, dr.ArrayBase]:
-    """Return two halves of each of ``rows``: all the first ones, then all the second ones.
-
-    The halves' means lie on both sides of the Gaussian's, on its longest axis.
-    """
+    """Return both halves of ``rows``, the first ones first, on each side along the longest axis."""
     twice = np.tile(rows, 2)
     new = population.take(population.to_device_indices(twice))
     longest = population.host("log_scales")[twice].argmax(axis=1)

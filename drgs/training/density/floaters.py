@@ -108,8 +108,7 @@ class Floaters(DensityStrategy):
         dr.eval(covered, inverse)
         weight, per_depth = rendering.weighted_sums(frame, covered, inverse)
         means = dr.unravel(types_of(type(alpha)).Array3f, gaussians.means.array)
-        position = camera.rotation @ (means - camera.center)
-        _, _, own = camera.lens.visibility(camera, position)
+        _, _, own = camera.lens.visibility(camera, camera.rotation @ (means - camera.center))
         return weight, own * per_depth
 
 

@@ -158,9 +158,8 @@ class MarkovChain(DensityStrategy):
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
         """Relocate transparent Gaussians to others, and add copies.
 
-        These are drawn in proportion to opacity. Rows end up as: Gaussians that were not drawn, in
-        their order and with their moments; those that were drawn; the copies. The last two begin
-        with moments of zero.
+        These are drawn in proportion to opacity. Rows end up as: those not drawn, in order and with
+        their moments; the drawn; the copies. The last two begin with moments of zero.
 
         Raises ``UserError`` if all are too transparent.
         """
@@ -203,9 +202,8 @@ class MarkovChain(DensityStrategy):
 def correct_copies(opacities: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return opacities of n coincident Gaussians that look like one, and factors of their scales.
 
-    opacities: (M,) of the one; counts: (M,) of n, of which at most ``MAX_COPIES`` count. The
-    paper's equation 9: composited, the copies are as opaque at their centre, and along a line
-    through it:
+    opacities: (M,) of the one; counts: (M,), n, at most ``MAX_COPIES``. The paper's equation 9:
+    composited, the copies are as opaque at their centre, and along a line through it:
 
     o' = 1 - (1 - o)^(1/n),   s'/s = o / sum_{j=1..n} C(n, j) (-1)^(j-1) o'^j / sqrt(j)
 

@@ -30,11 +30,7 @@ from drgs.training.density.strategy import (
 def density_strategy(
     config: FitConfig, dataset: Dataset | None = None, growth: DensityStrategy | None = None
 ) -> DensityStrategy:
-    """Return the strategy of a fit: growth, and what removes floaters and the least Gaussians.
-
-    dataset: None for an estimate; growth: a strategy instead of ``densify.strategy``.
-    """
-
+    """Return a fit's strategy; dataset: None: an estimate; growth: in place of the configured."""
     densify = config.densify
     if growth is None:
         strategy = STRATEGIES.get(densify.strategy, "densify.strategy")

@@ -103,10 +103,7 @@ class NaturalSelection(DensityStrategy):
 
 
 def keep_best(population: Population, scores: np.ndarray, count: int) -> DensityReport:
-    """Remove all but the ``count`` rows of the highest scores (N,), which keep their moments.
-
-    Of equal scores, the first ones stay.
-    """
+    """Keep ``count`` rows of the highest scores (N,), with their moments; of equals, the first."""
     order = np.argsort(-scores, kind="stable")  # a NaN comes last
     population.edit(population.to_device_indices(np.sort(order[:count])))
     return DensityReport(num_gaussians=count, pruned=len(scores) - count)

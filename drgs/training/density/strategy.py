@@ -38,10 +38,7 @@ class DensityReport:
 
 @dataclass(frozen=True)
 class StepInfo:
-    """Statistics of an iteration, for a strategy; nothing of it is differentiated.
-
-    N is the number of rows of :meth:`Population.value`.
-    """
+    """Statistics of an iteration, not differentiated; N: the rows of :meth:`Population.value`."""
 
     iteration: int
     width: int  # px, of the film of the iteration's view
@@ -63,10 +60,7 @@ def absolute_errors(image: TensorXf, photograph: TensorXf) -> Float:
 
 
 def displace_means(rows: Mapping[str, dr.ArrayBase], offsets: np.ndarray) -> TensorXf:
-    """Return means moved along their own axes: mean + R(q) (s * offset), tensor (M, 3).
-
-    rows: of every parameter by name; offsets: (M, 3), in standard deviations.
-    """
+    """Return means moved along their axes by offsets (M, 3): mean + R(q) (s * offset), s: stds."""
     means, log_scales = rows["means"], rows["log_scales"]
     t = types_of(type(means.array))
     offset = dr.unravel(t.Array3f, from_host(t.Float, offsets))
@@ -136,10 +130,7 @@ class DensityStrategy(Protocol):
         return {}
 
     def perturb(self, population: Population, iteration: int, means_lr: float) -> None:
-        """Change values after each optimizer step; waits for nothing.
-
-        means_lr: the step's rate of the means, world units.
-        """
+        """Change values after each step; waits for nothing. means_lr: their rate, world units."""
 
     def is_due(self, iteration: int) -> bool:
         """Return whether :meth:`refine` is called after this iteration, and after the other calls.
@@ -159,8 +150,5 @@ class DensityStrategy(Protocol):
         """Continue from :meth:`state`, where :meth:`begin` was called; other names are ignored."""
 
     def max_num_gaussians(self, start: int, iterations: int) -> int:
-        """Return the most Gaussians of a fit of so many iterations that starts with ``start``.
-
-        Called for an estimate, without :meth:`begin`.
-        """
+        """Return the most Gaussians of a fit from ``start`` on; called without :meth:`begin`."""
         return start

@@ -123,9 +123,7 @@ class Communicator:
         """Return this rank's part of the rows on rank 0: as many as ``like`` has."""
         counts = self.all_gather(np.array(len(like)))
         own = np.empty_like(like)
-        parts = None
-        if self.is_root:
-            parts = _parts(np.ascontiguousarray(rows), counts)
+        parts = _parts(np.ascontiguousarray(rows), counts) if self.is_root else None
         wait(self.comm.Iscatterv(parts, _bytes(own)))
         return own
 

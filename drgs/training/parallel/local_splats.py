@@ -78,8 +78,7 @@ class LocalSplats:
         boxes, stored = (Rows.from_columns(each.load(rows)) for each in (splats.boxes, splats.rows))
         depths = dr.gather(float_type, splats.depths, rows)
         dr.eval(boxes, stored, depths)
-        flat = [*boxes.blocks, *stored.blocks, depths]
-        return [each.numpy().reshape(count, -1) for each in flat]
+        return [each.numpy().reshape(count, -1) for each in [*boxes.blocks, *stored.blocks, depths]]
 
     def unpack(self, rows: UInt32, blocks: Blocks, width: int) -> list[Float]:
         """Return columns for all rows of this rank: the blocks' numbers of ``rows``, else 0."""

@@ -41,9 +41,8 @@ def local_gaussians(gaussians: Gaussians, comm: Communicator) -> Gaussians:
     if comm.size == 1:
         return gaussians
     own = Shard(gaussians.num_gaussians, comm.rank, comm.size).local
-    rows = {name: getattr(gaussians, name)[own] for name in PARAMETER_NAMES}
-    smoothing = None if gaussians.smoothing is None else gaussians.smoothing[own]
-    return replace(gaussians, **rows, smoothing=smoothing)
+    names = (*PARAMETER_NAMES, *(() if gaussians.smoothing is None else ("smoothing",)))
+    return replace(gaussians, **{name: getattr(gaussians, name)[own] for name in names})
 
 
 def check_shardable(config: FitConfig, size: int, num_gaussians: int) -> None:
@@ -54,8 +53,7 @@ def check_shardable(config: FitConfig, size: int, num_gaussians: int) -> None:
             f"optimizer.views_per_step must be at least the number of processes ({size}), which "
             f"share the views of a step, got {views}; give it with --set"
         )
-    to = config.densify.prune.to
-    _check_count(min(num_gaussians, to or num_gaussians), size)
+    _check_count(min(num_gaussians, config.densify.prune.to or num_gaussians), size)
 
 
 def _check_count(num_gaussians: int, size: int) -> None:
@@ -199,10 +197,7 @@ class ShardedPopulation(Population):
     def gather_terms(
         self, terms: list[Float], compute: Callable[[Mapping[str, dr.ArrayBase]], list[Float]]
     ) -> list[np.ndarray]:
-        """Return terms of the loss over all rows.
-
-        They are computed again, because sums of the ranks' shares would round differently.
-        """
+        """Compute terms over all rows anew, as sums of the ranks' shares would round otherwise."""
         if not terms:
             return []
         return [np.array(term, np.float32) for term in compute(_AllRows(self))]

@@ -76,10 +76,7 @@ class SeveralViews:
         self._views: list[_View] = []
 
     def begin(self, views: Sequence[StepView], move_sensor: Callable[[StepView], None]) -> None:
-        """Project the rows of this rank for the views of other ranks.
-
-        move_sensor: brings the sensor of such a view to where it is now.
-        """
+        """Project own rows for other ranks' views; move_sensor: brings a view's sensor in place."""
         size, num = self.comm.size, self.views_per_step
         self._views = [_View(view, renderer_of(view.place, num, size)) for view in views]
         if size == 1:
@@ -123,10 +120,7 @@ class SeveralViews:
             each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
 
     def finish(self, names: Sequence[Sequence[str]]) -> list[ViewGradients]:
-        """Return the gradients of all views; their sum is in the parameters now.
-
-        names: of each view's planes for weighted sums.
-        """
+        """Return all views' gradients, whose sum the parameters have; names: planes by view."""
         for each, weights in zip(self._views, names, strict=True):
             if each.renderer != self.comm.rank:
                 self._receive_results(each, weights)
@@ -176,8 +170,7 @@ class SeveralViews:
     def _receive_results(self, each: _View, weights: Sequence[str]) -> None:
         """Receive derivatives and weighted sums of this rank's rows from the view's renderer."""
         for time, local in enumerate(each.local):
-            width = local.num_stored - local.num_keys
-            columns = self._exchange.receive_columns(each, time, width)
+            columns = self._exchange.receive_columns(each, time, local.num_stored - local.num_keys)
             each.gradients.append(local.gradients(columns))
         for name in weights:
             times = range(len(each.local))
@@ -212,10 +205,7 @@ class SeveralViews:
             each.first_nonfinite = fault
 
     def _add_with_camera(self, each: _View) -> None:
-        """Add the derivatives of a view, and those of its camera, which its renderer sums.
-
-        Each rank adds the terms of its rows, which are summed as if one rank had them all.
-        """
+        """Add a view's derivatives, and its camera's, which its renderer sums over all rows."""
         with dr.suspend_grad():
             gaussians, by_time, of_cameras = dr.detach(self.integrator.gaussians), [], []
             for local, gradients in zip(each.local, each.gradients, strict=True):
@@ -232,8 +222,7 @@ class SeveralViews:
         each.first_nonfinite = total.first_nonfinite
         if of_cameras:
             state = read_sensor(each.view.view.sensor, self.integrator.near)
-            cameras = attached_cameras(state, self.integrator.ignore)
-            accumulate_in_sensor(cameras, of_cameras)
+            accumulate_in_sensor(attached_cameras(state, self.integrator.ignore), of_cameras)
 
     def _accumulate(self, gradients: Gaussians) -> None:
         for name, parameter in self.params.items():
