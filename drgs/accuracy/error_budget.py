@@ -488,15 +488,11 @@ class Search:
             elif errors[place] <= budget:
                 return place, np.sqrt(found[place]).tolist(), errors
             else:
+                digits = 1 - math.floor(math.log10(errors[place]))
+                least = math.ceil(errors[place] * 10**digits) / 10**digits  # two, rounded up
                 raise ValueError(
-                    f"{budget:.2g} cannot be met here: the most accurate choice is within "
-                    f"{_rounded_up(errors[place])}"
+                    f"{budget:.2g} cannot be met here: the most accurate choice is within {least:g}"
                 )
-
-
-def _rounded_up(error: float) -> str:
-    digits = 1 - math.floor(math.log10(error))
-    return f"{math.ceil(error * 10**digits) / 10**digits:g}"
 
 
 def check_no_extensions(given: Approximations) -> None:

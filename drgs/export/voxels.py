@@ -96,8 +96,7 @@ class Voxels:
     def visit(self, rows: np.ndarray, at_center: bool) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield voxels' keys, Gaussians' indices and contributions o exp(-d^2 / 2), in parts.
 
-        at_center: take the distance d, in standard deviations, to the voxel's center; else to its
-        point that is nearest to the mean.
+        at_center: d, in deviations, is to the voxel's center; else to its point nearest the mean.
         """
         totals = self.counts[rows].prod(axis=1).astype(np.int64)
         part = (np.cumsum(totals) - totals) // VISITS_AT_ONCE

@@ -41,8 +41,7 @@ def rank_photographs(
 ) -> list[RankedPhotograph]:
     """Return the training photographs, worst first; the first few have hints and images.
 
-    Photographs that other processes have are left out. render: without what a fit optimises for
-    each photograph, such as colours.
+    Photographs of other processes are left out. render: without photographs' own, such as colours.
     """
     views = [v for v in views if not (isinstance(v.image, LazyImage) and v.image.is_elsewhere)]
     if not views:

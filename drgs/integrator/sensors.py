@@ -107,8 +107,7 @@ def depth_range(sensor: mi.Sensor) -> tuple[float, float]:
 def read_sensor(sensor: mi.Sensor, near: float) -> SensorState:
     """Collect a sensor's state without reading anything back from the device.
 
-    near: near plane, scene units; the larger of it and the sensor's ``near_clip`` applies. Raises
-    PluginTypeError as :func:`depth_range` does.
+    near: scene units; the larger of it and ``near_clip`` applies. Raises as :func:`depth_range`.
     """
     near_clip, _ = depth_range(sensor)
     if isinstance(sensor, CameraSensor):

@@ -194,8 +194,7 @@ def read_elements(
 ) -> tuple[dict[str, np.ndarray], dict[str, Scalar]]:
     """Return elements as structured arrays, and the values in the header's comments.
 
-    Elements of ``names`` other than ``vertex`` may be missing. What follows an element with lists,
-    such as faces, is not read.
+    Elements but ``vertex`` may be missing. What follows one with lists, as faces, is not read.
 
     Raises :class:`UserError` naming the file and what it lacks: it must be complete, and elements
     of ``names`` must have numbers only.

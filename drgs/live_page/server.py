@@ -1,7 +1,6 @@
 """The local web server of a page: viser, without console output and network access.
 
-Imported only for a page; the extra ``viewer`` installs viser. The page is served to this machine
-only, where any program may use it.
+Imported only for a page; viser is of the extra ``viewer``. Only this machine's programs are served.
 """
 
 from __future__ import annotations

@@ -692,8 +692,7 @@ def _camera_mean_gradients(
 def _quat_gradients(quats: np.ndarray, d_rotations: np.ndarray) -> np.ndarray:
     """Return the gradients (N, 4) with respect to the quaternions as stored, not normalised.
 
-    First the derivatives of the entries of R(q) with respect to w, x, y, z (3DGS, appendix A),
-    then those of q -> q / |q|.
+    First the derivatives of R(q) by w, x, y, z (3DGS, appendix A), then those of q -> q / |q|.
     """
     unit_quats, norms = _normalize(quats, fallback=(1.0, 0.0, 0.0, 0.0))
     w, x, y, z = unit_quats.T

@@ -79,7 +79,8 @@ class _Estimate:
             points = dr.gather(mi.Point3f, means, shaded)
             directions = dr.gather(mi.Vector3f, normals, shaded)
             lit, dark = self._irradiance(points, directions, self._transmittance)
-            dr.scatter(ratio, dr.select(lit + dark > 0, lit / (lit + dark), 1), shaded)
+            found = dr.select(lit + dark > 0, lit / (lit + dark), 1)
+            dr.scatter(ratio, found, shaded)
         dr.eval(ratio)
         return ratio
 

@@ -259,8 +259,7 @@ class AdaptiveDensityControl(DensityStrategy):
     ) -> dict[str, dr.ArrayBase]:
         """Return the clones, then ``split_count`` samples of each row that is split.
 
-        A sample is drawn from its parent's own Gaussian: mean + R(q) (s * n), n standard normal. A
-        clone is the same with n = 0.
+        A sample of its parent is mean + R(q) (s * n), n standard normal; a clone has n = 0.
         """
         num_clones = len(chosen.clone)
         samples_of = np.repeat(chosen.split, self.settings.split_count)

@@ -35,8 +35,7 @@ from drgs.training.density.strategy import (
 )
 
 MAX_COPIES = 51
-"""Most copies of a Gaussian in its place at a time, as in the paper's code. Binomials up to here
-are exact in double precision."""
+"""Most copies of a Gaussian at a time, as in the paper's code; up to here, binomials are exact."""
 
 MAX_OPACITY = 1 - 2.0**-23  # largest opacity of copies: the largest in float32 that has a logit
 
@@ -272,8 +271,7 @@ def normals(float_type: type, rows: UInt32, iteration: UInt32, seed: UInt32) -> 
 
     rows: UInt32 (N,); iteration, seed: UInt32 (1,), opaque, so that each value is no new kernel.
 
-    Box and Muller's transform of a hash of the three (``pcg4d``: Jarzynski and Olano 2020, Hash
-    Functions for GPU Rendering).
+    Box and Muller's transform of a hash of the three (``pcg4d``: Jarzynski and Olano 2020).
     """
     t = types_of(float_type)
     words = pcg4d(rows, t.UInt32(iteration), t.UInt32(seed), t.UInt32(0))
