@@ -1,5 +1,7 @@
 """Returns of extensions are checked where they are taken; objects and classes are told apart."""
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -7,12 +9,14 @@ import pytest
 from support import small_fits as fits
 
 import drgs
+from drgs.cameras.lens import LENSES, Pinhole
 from drgs.config.extensions import LOSSES
 from drgs.config.load import config_from
 from drgs.core.errors import UserError
 from drgs.core.registry import temporary_registrations
 from drgs.effects.base import TrainingEffect
 from drgs.effects.optimised import OptimisedEffect
+from drgs.io.formats import FORMATS, FileFormat
 from drgs.training.density.strategy import DensityReport, DensityStrategy, absolute_errors
 from drgs.training.losses import Loss, LossTerm
 
@@ -154,3 +158,35 @@ def test_an_effect_without_a_step_of_its_own_is_optimised():
 def test_missing_methods_are_named_when_a_class_is_registered():
     with temporary_registrations(), pytest.raises(TypeError, match='"mine" must define __call__'):
         LOSSES.register("mine")(type("Mine", (Loss,), {}))
+
+
+@pytest.mark.parametrize("count", [2, 0])
+def test_rows_are_one_or_one_for_each_view(count):
+    rows = OptimisedEffect({"gain": np.zeros((count, 1))}, {"gain": 0.1})
+    rows.name = "gain"
+    with pytest.raises(UserError, match=rf"gain must have 1 row, or \d+ for the .*, got {count}$"):
+        drgs.train(small_config(), fits.plain_dataset(), effects=[rows])
+
+
+def test_a_second_format_of_a_suffix_is_refused():
+    """An installed one of a shipped suffix would never be read; one module may register again."""
+
+    def declare(suffix):
+        return type("Mine", (FileFormat,), {"suffix": suffix, "description": "mine"})
+
+    with temporary_registrations():
+        FORMATS.register("first")(declare(".mine"))
+        FORMATS.register("first")(declare(".mine"))
+        for suffix, owner in ((".mine", "first"), (".spz", "spz")):
+            with pytest.raises(ValueError, match=f"suffix {suffix} is that of {owner} already"):
+                FORMATS.register("second")(declare(suffix))
+
+
+def test_coefficients_with_names_of_other_properties_are_refused():
+    with temporary_registrations():
+        LENSES.register("odd")(dataclass(frozen=True)(type("Odd", (Pinhole,), ODD)))
+        with pytest.raises(RuntimeError, match=r"has coefficients with the names of other .*, cx"):
+            mi.load_dict({"type": "calibrated", "lens": "odd"})
+
+
+ODD = {"__annotations__": {"cx": float, "bend": float}, "cx": 0.0, "bend": 0.0}
