@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from drgs.cli.commands import MAX_PORT, CommandParser, bounded_int, file_or_folder, run_command
 from drgs.cli.ending import INTERRUPTED_STATUS
 from drgs.cli.execution import add_execution_arguments, execution_settings
+from drgs.config.changes import with_iterations
 from drgs.config.extensions import describe_extensions
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
@@ -29,7 +30,7 @@ from drgs.datasets.folders import config_for
 from drgs.fit.budget import Budget, parse_duration
 from drgs.fit.fit_folder import FitFolder
 from drgs.fit.session import FitSession
-from drgs.results.folder import CONFIG, load_moved_config
+from drgs.results.folder import CONFIG, has_results, load_moved_config, load_run_config
 from drgs.training.parallel.communicator import Communicator
 
 if TYPE_CHECKING:  # imported with --view
@@ -186,12 +187,18 @@ def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:
     data = [] if args.data is None else [f"data.path={args.data}"]
     if args.resume is not None:
         given = args.out is not None, args.budget is not None, args.overwrite, args.leave_out
-        if args.overrides or any(given):
+        more = [text for text in args.overrides if text.startswith("iterations=")]
+        if len(more) < len(args.overrides) or any(given):
             raise UserError(
                 f"--resume: takes its configuration from {args.resume / CONFIG}: leave out --out, "
-                "--set, --leave-out, --budget and --overwrite"
+                "--set (but for iterations=N), --leave-out, --budget and --overwrite"
             )
-        return load_moved_config(args.resume, data), args.resume
+        config = load_moved_config(args.resume, data)
+        if more and not has_results(args.resume):
+            raise UserError(f"--set {more[0]}: {args.resume} has not ended yet; leave it out")
+        if more:
+            config = with_iterations(config, load_run_config(args.resume, more).iterations)
+        return config, args.resume
     out = [] if args.out is None else [f"output.dir={args.out}"]
     left_out = [f"data.leave_out={json.dumps(args.leave_out)}"] if args.leave_out else []
     overrides = args.overrides + left_out + data + out

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, cast
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from drgs.config.approximations import Approximations
 from drgs.config.changes import given_keys, with_changes
@@ -29,7 +30,7 @@ from drgs.fit.loop import History
 from drgs.fit.report import MAX_PICTURES, FitImages, write_images, write_results
 from drgs.gaussians.parameters import Gaussians
 from drgs.results import folder
-from drgs.results.history import write_density, write_history
+from drgs.results.history import HistoryRow, write_density, write_history
 from drgs.results.html_viewer import DisplaySettings, shows_as_fitted
 from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
 from drgs.results.refined_cameras import write_views
@@ -59,8 +60,37 @@ class FitFolder:
         if self.overwrites:
             return False
         if self.resumes:
-            return folder.has_results(self.path)
+            return self.iterations_done() >= config.last_iteration
         return folder.is_finished(self.path, config)
+
+    def iterations_done(self) -> int:
+        """Return the iterations of the results that a resumed fit has; 0: it has none."""
+        path = self.path / folder.METRICS
+        try:
+            return int(json.loads(path.read_text())["iterations"]) if self.resumes else 0
+        except FileNotFoundError:
+            return 0
+        except (OSError, ValueError, KeyError, TypeError):
+            raise UserError(
+                f"{path}: must be what a fit wrote, got something else; remove it, and resume"
+            ) from None
+
+    def history_so_far(self) -> History:
+        """Return the table of the results in the folder; empty if it cannot be read."""
+        with suppress(OSError, ValueError, IndexError):
+            rows = np.genfromtxt(self.path / folder.HISTORY, delimiter=",", skip_header=1)
+            rows = rows.reshape(-1, len(HistoryRow.__dataclass_fields__))
+            return History.from_arrays(rows, np.zeros((0, 1)), rows[-1, 5])
+        return History()
+
+    def start_of_run(self, config: FitConfig) -> FitConfig:
+        """Return the configuration of the start: if the fit goes on, its Gaussians."""
+        if not self.iterations_done():
+            return config
+        start = {"start": "auto", "point_cloud": None, "half_extent": None}
+        start |= {"max_point_error": None, "min_track_length": None}
+        start["gaussians"] = self.path / folder.GAUSSIANS
+        return with_changes(config, {f"init.{name}": value for name, value in start.items()})
 
     def checkpoint_for(self, config: FitConfig, has_budget: bool) -> Checkpoint | None:
         """Return the checkpoint to continue from, if there is one.

@@ -175,6 +175,9 @@ class FitSession:
         self.history = History()  # starts its clock
         if comm.broadcast_numbers(checkpoint is not None):
             self._restore(checkpoint)
+        else:
+            done = 0 if self.folder is None else self.folder.iterations_done()
+            self._go_on(int(comm.broadcast_numbers(done)))
         return plan
 
     def _load(self) -> Checkpoint | None:
@@ -240,7 +243,7 @@ class FitSession:
             f"'{dataset.test_split}' to measure on; background {config.data.background}; "
             f"scene extent {dataset.extent:.3g}"
         )
-        start = start_of(config, dataset)
+        start = start_of(self.folder.start_of_run(config) if self.folder else config, dataset)
         self._print(description_of_start(config, start))
         reasons = {} if self.examination is None else self.examination.reasons
         self._print(format_effects(summary_of_fit(config, dataset, reasons)))
@@ -257,6 +260,19 @@ class FitSession:
             state, self.history = checkpoint.trainer, History.from_arrays(*past)
         self.trainer.restore(state)
         self._print(f"continues at iteration {self.trainer.iteration}")
+
+    def _go_on(self, done: int) -> None:
+        """Continue after so many iterations of a fit that had ended, with its Gaussians alone."""
+        if done:
+            at_once = self.trainer.config.optimizer.views_per_step
+            self.trainer.iteration = -(-done // at_once) * at_once  # a step begins after it
+            self._print(
+                f"goes on after {done:,} iterations with the rates of a fit of "
+                f"{self.trainer.config.iterations:,}; Adam's moments, the numbers of effects, and "
+                "the table of changes begin anew"
+            )
+        if done and self.folder is not None:
+            self.history = self.folder.history_so_far()
 
     def iterate(self) -> bool:
         """Run the iterations that are left, with checkpoints; False if Ctrl-C stopped them.
