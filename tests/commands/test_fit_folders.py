@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
+import yaml
 from support.commands import assert_ends_well
 from support.fit_command import (
     ITERATIONS,
@@ -345,3 +346,40 @@ def test_half_removed_run_is_not_finished(config, tmp_path, monkeypatch):
     assert removed[0] == "metrics.json"
     assert "this fit is finished" not in assert_fits(config, "--out", out).stdout
     assert_done(out)
+
+
+# A fit that has ended goes on
+
+
+def test_a_fit_that_has_ended_goes_on_from_its_gaussians(ended):
+    out, before = ended / "out", (ended / "out" / "history.csv").read_text().splitlines()
+    more = f"iterations={2 * ITERATIONS}"
+    outcome = assert_fits("--resume", out, "--set", more)
+    assert f" Gaussians of {out / 'point_cloud.ply'}; near plane" in outcome.stdout
+    assert f"goes on after {ITERATIONS} iterations with the rates of a fit of" in outcome.stdout
+    rows = (out / "history.csv").read_text().splitlines()
+    assert rows[: len(before)] == before and len(rows) == 2 * ITERATIONS + 1
+    config = yaml.safe_load((out / "config.yml").read_text())
+    assert config["iterations"] == 2 * ITERATIONS and config["init"]["gaussians"] is None
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["iterations"] == 2 * ITERATIONS
+    assert "this fit is finished" in assert_fits("--resume", out, "--set", more).stdout
+    path = out / "config.yml"  # or the number in the configuration is changed
+    text = path.read_text().replace(f"iterations: {2 * ITERATIONS}\n", "iterations: 20\n")
+    path.write_text(text)
+    assert "goes on after" in assert_fits("--resume", out).stdout
+    assert len((out / "history.csv").read_text().splitlines()) == 21
+
+
+def test_what_a_fit_does_not_go_on_with_is_refused(stopped, ended):
+    refused = {
+        (stopped, "iterations=99"): "has not ended yet; leave it out",
+        (ended, "seed=7"): "leave out --out, --set (but for iterations=N)",
+        (ended, "iterations=x"): "iterations must be an integer, got 'x'",
+    }
+    for (folder, text), message in refused.items():
+        words = "--resume", folder / "out", "--set", text
+        assert_fit_refused(*words, folder=folder, message=message)
+    (ended / "out" / "metrics.json").write_text("[]")
+    message = "metrics.json: must be what a fit wrote, got something else; remove it, and resume"
+    assert_fit_refused("--resume", ended / "out", folder=ended, message=message)
