@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from numbers import Integral, Real
 from typing import Any, cast
@@ -19,7 +18,7 @@ from typing_extensions import override
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera
 from drgs.config.approximations import Approximations
-from drgs.core.arrays import from_host, interleave, types_of
+from drgs.core.arrays import from_host, interleave, real_numbers, types_of
 from drgs.core.constants import ALPHA_CUT, LOW_PASS, MAX_FEATURES
 from drgs.core.errors import did_you_mean
 from drgs.core.llvm import ensure_usable_llvm
@@ -218,16 +217,8 @@ def _tensor_type(means: Array) -> type[TensorXf]:
         )
     from drjit import llvm
 
-    is_double = _host("means", means).dtype == np.float64
+    is_double = real_numbers("rasterization()", "means", means).dtype == np.float64
     return cast(type[TensorXf], llvm.ad.TensorXf64 if is_double else llvm.ad.TensorXf)
-
-
-def _host(name: str, value: Any) -> np.ndarray:
-    """Return an array that is none of Dr.Jit's, of real numbers."""
-    with suppress(ValueError):  # rows of different lengths
-        if (values := np.asarray(value)).dtype.kind in "biuf":
-            return values
-    raise TypeError(f"rasterization(): {name} must be an array of real numbers, got {value!r:.80}")
 
 
 def _tensor(name: str, value: Any, tensor_type: type[TensorXf]) -> TensorXf:
@@ -236,7 +227,7 @@ def _tensor(name: str, value: Any, tensor_type: type[TensorXf]) -> TensorXf:
         return value
     flat_type = dr.array_t(tensor_type)
     if not dr.is_array_v(value):
-        values = _host(name, value)
+        values = real_numbers("rasterization()", name, value)
         return tensor_type(from_host(flat_type, values), values.shape)
     if dr.is_tensor_v(value):
         return tensor_type(flat_type(value.array), value.shape)

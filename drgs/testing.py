@@ -21,7 +21,7 @@ and depth.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, cast
 
@@ -35,7 +35,7 @@ from drgs.cameras.camera import Aperture, Camera, Shutter, cameras_in_time
 from drgs.cameras.lens import PINHOLE, Lens
 from drgs.config.approximations import Approximations
 from drgs.core.arrays import from_host
-from drgs.core.errors import UnsupportedError
+from drgs.core.errors import UnsupportedError, UserError, check_type, did_you_mean
 from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.splatting import rendering
@@ -55,6 +55,8 @@ TRANSPOSE_TOLERANCE = 1e-11
 
 NUM_POINTS, MAX_RAY_ERROR = 1000, 1e-9
 """Points around the camera, of laws of lenses, and the largest error of a ray's direction."""
+
+WHOLE = "degree", "count", "width", "height", "seed"  # numbers of a case
 
 MAX_MARKED_SHARE = 0.02  # of pixels near a threshold, which are not compared
 
@@ -87,6 +89,21 @@ class Case:
     # Relative to the largest value: a mean at 40 px carries 1e-5 px in float32, and alpha changes
     # by at most 1.1 per px; gradients add rounding in S / (1 - a), and derivatives that cancel.
     single_tolerance: float = 1e-4
+
+    def __post_init__(self) -> None:
+        """Raise :class:`UserError` for a field of another type, or out of range."""
+        check_type("Case()", "lens", self.lens, Lens)
+        for name, value in vars(self).items():
+            if name in ("shutter", "reference", "scene") and value is not None:
+                check_type("Case()", name, value, Callable)
+            elif isinstance(getattr(Case, name, None), int | float):
+                least, most = (0, 3) if name == "degree" else (0 if name == "seed" else 1e-300, 1e6)
+                check_type("Case()", name, value, *([int] if name in WHOLE else [int, float]))
+                if not least <= cast(float, value) <= most:
+                    raise UserError(f"Case(): {name} must be {least} to {most:g}, got {value}")
+        known = {each.name for each in fields(Approximations)}
+        for name in self.approximations.keys() - known:
+            raise UserError(f"Case(): approximations has no {name}{did_you_mean(name, known)}")
 
     @cached_property
     def pose(self) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import Generic, TypeVar, cast
@@ -71,6 +72,14 @@ def from_host(flat_type: type[Array], values: ArrayLike) -> Array:
     aligned = empty_on_host(flat_type, (values.size,))
     aligned[:] = values.ravel()
     return flat_type(aligned)
+
+
+def real_numbers(where: str, name: str, value: object) -> np.ndarray:
+    """Return an array that is none of Dr.Jit's; TypeError unless its numbers are real."""
+    with suppress(ValueError):  # rows of different lengths
+        if (values := np.asarray(value)).dtype.kind in "biuf":
+            return values
+    raise TypeError(f"{where}: {name} must be an array of real numbers, got {value!r:.80}")
 
 
 def empty_on_host(flat_type: type, shape: tuple[int, ...]) -> np.ndarray:

@@ -10,7 +10,7 @@ import re
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from typing_extensions import override
 
@@ -38,6 +38,13 @@ class PluginTypeError(PluginError, TypeError):
 
 class UnsupportedError(PluginError, NotImplementedError):
     """A :class:`PluginError` about something that the plugin has no code for."""
+
+
+def check_type(where: str, name: str, value: object, *types: Any) -> None:
+    """Raise :class:`UserError` for an argument that is of none of these types."""
+    if not isinstance(value, types):
+        known = " or ".join(each.__name__ for each in types)
+        raise UserError(f"{where}: {name} must be {known}, got {one_line(repr(value), 60)}")
 
 
 class Place(NamedTuple):

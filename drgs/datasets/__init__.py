@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 from drgs.config.load import config_from
 from drgs.config.schema import DataConfig
+from drgs.core.errors import check_type
 from drgs.core.origin import WORLD, choose_origin, format_origin
 from drgs.datasets.types import Dataset, View, ViewFilter, Viewpoint, all_views
 
@@ -36,6 +37,7 @@ def load_dataset(
 
     Raises :class:`UserError` naming the file, the key, what was expected and what was got.
     """
+    check_type("load_dataset()", "source", source, str, Path, DataConfig)
     if settings or not isinstance(source, DataConfig):
         given = source.model_dump() if isinstance(source, DataConfig) else {"path": source}
         source = config_from({"data": {**given, **settings}}, "load_dataset()").data

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from types import NoneType
 from typing import cast
 
 import mitsuba as mi
@@ -28,7 +29,7 @@ from drgs.config.extensions import EFFECTS, EXAMINERS
 from drgs.config.load import config_from
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
-from drgs.core.errors import UserError, one_line
+from drgs.core.errors import UserError, check_type, one_line
 from drgs.datasets.types import Dataset
 from drgs.effects.base import Finding, Progress, ShortFit
 from drgs.effects.photometry import camera_key
@@ -139,6 +140,9 @@ def examine(
 
     Effects look for themselves: ``drgs.effects.base.TrainingEffect.look_for``.
     """
+    check_type("examine()", "dataset", dataset, Dataset)
+    check_type("examine()", "config", config, FitConfig, Mapping, NoneType)
+    check_type("examine()", "seconds", seconds, int, float, NoneType)
     started = time.perf_counter()
     end = math.inf if seconds is None else started + seconds
     if not isinstance(config, FitConfig):

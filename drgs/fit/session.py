@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import NoneType
 from typing import TYPE_CHECKING
 
 import mitsuba as mi
@@ -24,7 +25,7 @@ from drgs.config.extensions import EXAMINERS
 from drgs.config.load import config_from, load_config
 from drgs.config.schema import FitConfig
 from drgs.core.environment import VARIANTS
-from drgs.core.errors import UserError, note_user
+from drgs.core.errors import UserError, check_type, note_user
 from drgs.core.memory import release_unused_memory
 from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
@@ -374,6 +375,9 @@ def train(
     Raises ``drgs.core.errors.UserError`` (a ValueError) for wrong input, naming the key and the
     remedy, and ``drgs.training.finite_checks.NonFiniteError`` if a number is not finite.
     """
+    check_type("train()", "config", config, FitConfig, Mapping, str, Path)
+    check_type("train()", "dataset", dataset, Dataset, NoneType)
+    check_type("train()", "callback", callback, Callable, NoneType)
     is_folder, parts = False, GivenParts(strategy, effects, loss, terms)
     if isinstance(config, (str, Path)):
         is_folder = Path(config).is_dir()

@@ -17,8 +17,8 @@ import drjit as dr
 import numpy as np
 from drjit.auto.ad import Array3f, Array4f, Matrix3f
 
-from drgs.core.arrays import from_host, types_of
-from drgs.core.errors import UserError, note_user
+from drgs.core.arrays import from_host, real_numbers, types_of
+from drgs.core.errors import UserError, check_type, note_user
 from drgs.core.files import atomic_path
 from drgs.core.origin import WORLD, Origin, format_origin
 from drgs.core.registry import HOW_TO_INSTALL
@@ -62,6 +62,7 @@ class Gaussians(Generic[Tensor]):
         """
         from drgs.io.formats import UP, Z_TO_Y, pop_origin, read_gaussians
 
+        check_type("Gaussians.load()", "path", path, str, Path)
         extension, arrays, rendered_with = read_gaussians(path)
         up = extension.value.up and rendered_with.pop(UP, extension.value.up)
         origin = pop_origin(path, rendered_with)
@@ -82,6 +83,7 @@ class Gaussians(Generic[Tensor]):
         """
         from drgs.io.formats import format_for, writable_formats
 
+        check_type("Gaussians.save()", "path", path, str, Path)
         chosen = format_for(path)
         if chosen is None:
             suffixes = ", ".join(each.value.suffix for each in writable_formats())
@@ -133,11 +135,14 @@ class Gaussians(Generic[Tensor]):
         world units; opacities: (N,); sh: (N, K, 3) coefficients, display space, of degree 0 to 3,
         K = (degree + 1)^2.
 
-        Raises ValueError for another shape, a scale that is not positive, or an opacity that is not
-        between 0 and 1.
+        Raises TypeError for values that are no real numbers, and ValueError for another shape, a
+        number that is not finite, a quaternion of zeros, a scale that is not positive, or an
+        opacity that is not between 0 and 1.
         """
+        given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
         means, quats, scales, opacities, sh = (
-            np.asarray(values, np.float32) for values in (means, quats, scales, opacities, sh)
+            real_numbers("Gaussians.from_numpy()", *item).astype(np.float32)
+            for item in given.items()
         )
         num = len(np.atleast_1d(means))
         shapes = {
@@ -152,10 +157,14 @@ class Gaussians(Generic[Tensor]):
             if values.shape not in allowed:
                 expected = " or ".join(map(str, allowed))
                 raise ValueError(f"{where}{name} must be of shape {expected}, got {values.shape}")
+            if not np.isfinite(values).all():
+                raise ValueError(f"{where}{name} must be finite in single precision")
         for name, values, most in (("scales", scales, np.inf), ("opacities", opacities, 1)):
             bad = values[~((values > 0) & (values < most))]
             if len(bad):
                 raise ValueError(f"{where}{name} must be above 0 and below {most}, got {bad[0]}")
+        if not quats.any(axis=1).all():
+            raise ValueError(f"{where}quats must not be all zero")
         return Gaussians(
             means=means,
             quats=quats,
