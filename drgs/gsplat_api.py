@@ -470,8 +470,7 @@ def _meta(views: list[_View]) -> dict[str, Any]:
     for view in views:
         rows = load_rows(view.gaussians, view.pipeline.sh_degree)
         splats = view.pipeline.project(rows, view.frame.camera)
-        brightness = dr.log(splats.opacities / ALPHA_CUT)
-        radii = dr.ceil(dr.sqrt(2 * brightness * splats.variances))
+        radii = dr.ceil(dr.sqrt(2 * dr.log(splats.opacities / ALPHA_CUT) * splats.variances))
         values_by_name = {
             "means2d": list(splats.means2d),
             "depths": [splats.depths],

@@ -151,8 +151,7 @@ class Case:
     def pipeline(self) -> Pipeline:
         """The pipeline without effects."""
         given = self.approximations if self.reference else {**SMOOTH, **self.approximations}
-        features = (color_features, depth_feature)
-        return pipeline_of(Approximations(**given), self.degree, features)
+        return pipeline_of(Approximations(**given), self.degree, (color_features, depth_feature))
 
     @property
     def is_differentiable_in_camera(self) -> bool:
@@ -228,8 +227,7 @@ def _rays(case: Case, film: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
 def random_scene(case: Case) -> Values:
     """Return Gaussians of a fraction of a pixel to a fifth of the film, on and around the film."""
     rng, n = np.random.default_rng(case.seed + 1), case.count
-    film = rng.uniform(-0.1, 1.1, (n, 2)) * [case.width, case.height]
-    origin, ray, is_seen = _rays(case, film)
+    origin, ray, is_seen = _rays(case, rng.uniform(-0.1, 1.1, (n, 2)) * [case.width, case.height])
     _, axis, _ = _rays(case, case.K[None, :2, 2])  # instead of rays beyond the lens model
     ray = np.where(is_seen[:, None], ray, axis)
     distance = rng.uniform(1.0, 4.0, n)[:, None]

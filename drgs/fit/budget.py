@@ -107,8 +107,7 @@ class Strategy:
 
 def target_of(config: FitConfig) -> int | None:
     """Return the number of Gaussians that a fit grows to; None: its strategy has none."""
-    section = getattr(config.densify, config.densify.strategy, None)
-    number = getattr(section, "gaussians", None)
+    number = getattr(getattr(config.densify, config.densify.strategy, None), "gaussians", None)
     return None if number is None else min(number, config.densify.max_gaussians)
 
 

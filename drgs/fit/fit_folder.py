@@ -251,8 +251,7 @@ def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
     Its header records approximations that are not the default. It has no smoothing filter with
     ``output.bake_smoothing``.
     """
-    others = config.model.approximations.non_default
-    gaussians = replace(gaussians, rendered_with=others or None)
+    gaussians = replace(gaussians, rendered_with=config.model.approximations.non_default or None)
     return _remove_filter(gaussians) if config.output.bake_smoothing else gaussians
 
 

@@ -119,8 +119,7 @@ def room_for_targets(config: FitConfig, dataset: Dataset, start: int, comm: Comm
             raise UserError(_refusal(config, dataset, start, memory, usable, comm.size))
 
     comm.collective(check)
-    left = usable - round(1.15 * memory.required_bytes)  # an estimate may be wrong
-    return max(0, left)
+    return max(0, usable - round(1.15 * memory.required_bytes))  # it may be wrong
 
 
 def _refusal(

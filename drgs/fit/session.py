@@ -194,8 +194,7 @@ class FitSession:
         if folder is not None:
             self._fingerprint = fingerprint_of(self.dataset)
             if checkpoint is not None:
-                now = self._fingerprint
-                check_same_data(folder.path, config.data.path, checkpoint.data, now)
+                check_same_data(folder.path, config.data.path, checkpoint.data, self._fingerprint)
         self.config = resolve_defaults(config, self.dataset)
         return checkpoint
 

@@ -156,16 +156,14 @@ def _depth(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
         backdrop = np.full((*depth.shape, 3), BACKDROP_GRAY)
         return ViewerFrame(to_bytes(backdrop), seconds, "nothing is seen")
     near, far = (float(end) for end in np.percentile(depths, DEPTH_RANGE))
-    position = np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
-    colors = colormaps["turbo"](position)[:, :, :3]
+    colors = colormaps["turbo"](np.clip((far - depth) / max(far - near, 1e-9), 0, 1))[:, :, :3]
     return ViewerFrame(over_backdrop(colors, alpha), seconds, f"red {near:.3g} to blue {far:.3g}")
 
 
 def _normals(scene: LiveScene, request: FrameRequest) -> ViewerFrame:
     image, seconds = scene.image(request, "normal:normal, alpha:alpha")
     normal, alpha = image[:, :, 3:6], image[:, :, 6]
-    length = np.linalg.norm(normal, axis=2, keepdims=True)
-    colors = 0.5 + 0.5 * normal / np.maximum(length, 1e-9)
+    colors = 0.5 + 0.5 * normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-9)
     note = "x, y, z of the world as red, green, blue"
     return ViewerFrame(over_backdrop(colors, alpha), seconds, note)
 

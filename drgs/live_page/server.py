@@ -85,8 +85,7 @@ def _checked_requests() -> Iterator[None]:
 
     def serve_checked(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
         def answer(connection: ServerConnection, request: Request) -> Any:
-            hosts = request.headers.get_all("Host")
-            names = [re.sub(r":\d{1,5}$", "", host) for host in hosts]
+            names = [re.sub(r":\d{1,5}$", "", host) for host in request.headers.get_all("Host")]
             if len(names) != 1 or names[0] not in HOSTS or len(request.path) > MAX_PATH:
                 return connection.respond(HTTPStatus.BAD_REQUEST, f"the host must be {ADDRESS}\n")
             return process_request(connection, request)

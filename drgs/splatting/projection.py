@@ -188,8 +188,7 @@ def project(
     if film.opacity_compensation is not None:
         opacities = opacities * film.opacity_compensation
         above_cut = above_cut & (opacities > NEGLIGIBLE_ALPHA)
-    direction = camera.lens.view_direction(camera, offset)
-    colors = (color or color_at_mean)(rows, direction, sh_degree)
+    colors = (color or color_at_mean)(rows, camera.lens.view_direction(camera, offset), sh_degree)
     numbers = [*film.means2d, *film.conic_factor, *colors]
     numbers += [] if film.ray is None else film.ray.numbers()
     finite = dr.isfinite(dr.detach(sum(numbers[1:], numbers[0])))

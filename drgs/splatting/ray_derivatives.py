@@ -51,7 +51,6 @@ def tangents_with_rays(
         tiles, model = frame.tiles, frame.tiles.bins.model
         if camera_tangents is not None:
             falloff = model.falloff.with_camera_tangents(camera_tangents)
-            bins = replace(tiles.bins, model=replace(model, falloff=falloff))
-            tiles = replace(tiles, bins=bins)
+            tiles = replace(tiles, bins=replace(tiles.bins, model=replace(model, falloff=falloff)))
         found.append(frame.order.tangent(tiles, direction))
     return found

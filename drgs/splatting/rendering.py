@@ -145,8 +145,7 @@ def render(gaussians: Gaussians, camera: Camera, pipeline: Pipeline) -> Frame:
 def render_splats(splats: SplatTable, camera: Camera, pipeline: Pipeline) -> Frame:
     """Render splats that are projected by ``camera`` and ``pipeline``; see :func:`render`."""
     model = pipeline.model.for_camera(camera)
-    grid = TileGrid(camera.width, camera.height, model.positions.samples)
-    bins = bin_splats(splats, grid, model)
+    bins = bin_splats(splats, TileGrid(camera.width, camera.height, model.positions.samples), model)
     order = group_features(pipeline.order.for_camera(camera), bins)
     return Frame(pipeline, camera, order, order.composite(bins, order.records(bins)))
 
@@ -328,8 +327,7 @@ def weighted_sums(frame: Frame, *planes: Float) -> list[Float]:
 
 def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
     """Add the derivatives of a loss that depends on several cameras."""
-    others = b.parameters.arrays
-    sums = {name: v + others[name] for name, v in a.parameters.arrays.items()}
+    sums = {name: v + b.parameters.arrays[name] for name, v in a.parameters.arrays.items()}
     total = GaussianGradients(
         parameters=Gaussians.from_arrays(sums),
         means2d=a.means2d + b.means2d,

@@ -191,8 +191,7 @@ def _tile_box(
 
     Pixel = dr.uint32_array_t(type(first))
     first_tile = Pixel(dr.select(visible, first, 0)) // TILE
-    last_tile = Pixel(dr.select(visible, last, 0)) // TILE
-    extent = last_tile - first_tile + 1
+    extent = Pixel(dr.select(visible, last, 0)) // TILE - first_tile + 1
     if model.period is not None:
         extent.x = dr.minimum(extent.x + t.UInt32(more), dr.opaque(t.UInt32, grid.columns))
     count = dr.select(visible, extent.x * extent.y, 0)
@@ -284,8 +283,7 @@ def stable_order(keys: UInt32, bound: int) -> UInt32:
 
     ``dr.argsort`` has no bound and needs three passes for 32 bits.
     """
-    buckets = 1 << (bound - 1).bit_length()
-    return bucket_order(keys, dr.width(keys), max(buckets, 2))
+    return bucket_order(keys, dr.width(keys), max(1 << (bound - 1).bit_length(), 2))
 
 
 def _touched_micros(
