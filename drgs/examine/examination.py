@@ -171,7 +171,9 @@ def examine(
             continue
         decision, base = _try(finding, base, folds, partial(progress, finding.effect), end)
         decisions.append(decision)
-    decisions.append(_reject(look_for_moving_things(base)))  # beside all that was chosen
+    chosen = {key for each in decisions if each.chosen for key in each.changes}
+    if "data.background" not in chosen:  # beside one colour, all of the object differs
+        decisions.append(_reject(look_for_moving_things(base)))
     num_held_out = sum(len(fold.test) for fold in folds[: base.num_folds])
     return Examination(tuple(decisions), num_held_out, time.perf_counter() - started)
 
