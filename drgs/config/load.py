@@ -204,15 +204,12 @@ def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
     if kind in ("extra_forbidden", "invalid_key"):
         return f"{where}: unknown key {key}{did_you_mean(key, known_keys())}"
     if kind == "missing":
-        return f"{where}: {key} is missing: {_description(key)}"
+        field = _find(key)
+        assert field is not None, "pydantic names fields"
+        about = field.description or getattr(field.annotation, "__doc__", "")
+        return f"{where}: {key} is missing: {about}"
     if kind == "value_error" and not key:
         # A relation between values that may come from the file and from the command line.
         origin = f"{file} with --set {' '.join(sorted(overridden))}" if overridden else file
         return f"{origin}: {context['error']}"
     return f"{where}: {key} {expectation(item)}, got {format_value(item['input'])}"
-
-
-def _description(key: str) -> str:
-    field = _find(key)
-    assert field is not None, "pydantic names fields"
-    return field.description or getattr(field.annotation, "__doc__", "")

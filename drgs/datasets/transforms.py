@@ -338,8 +338,7 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
     model, values = frame.values.camera_model, frame.values
     name = "opencv" if model is None else LENS_OF_MODEL.get(model, model)
     is_of_colmap = model is None or model in LENS_OF_MODEL
-    names = _coefficient_names(model)
-    given = {k: v for k in names if (v := getattr(values, k, None)) is not None}
+    given = {k: v for k in _coefficient_names(model) if (v := getattr(values, k, None)) is not None}
     for key, value in given.items():
         if type(value) not in (int, float) or not math.isfinite(value):
             got = one_line(json.dumps(value), 60)

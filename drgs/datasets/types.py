@@ -54,8 +54,7 @@ def evenly_spaced(items: Sequence[T], most: int) -> tuple[T, ...]:
 
 def _spread(views: Sequence[Viewpoint]) -> float:
     centers = np.stack([view.center for view in views])
-    distances = np.linalg.norm(centers - centers.mean(axis=0), axis=1)
-    return float(1.1 * distances.max())
+    return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

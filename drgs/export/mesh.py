@@ -162,9 +162,8 @@ def volume_of(images: Sequence[DepthImage], size: int) -> tuple[np.ndarray, floa
     voxel = float((high - low).max()) / size
     border = np.ceil(TRUNCATION) + 1
     x, y, z = (np.ceil((high - low) / voxel) + 2 * border).astype(int).tolist()
-    require_memory(
-        f"--mesh-size {size}", VOXEL_BYTES * x * y * z, f"a volume of {x * y * z:,} voxels"
-    )
+    num = x * y * z
+    require_memory(f"--mesh-size {size}", VOXEL_BYTES * num, f"a volume of {num:,} voxels")
     return low - border * voxel, voxel, (x, y, z)
 
 

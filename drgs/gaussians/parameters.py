@@ -2,8 +2,7 @@
 
 A :class:`Gaussians` comes from a file, from numpy arrays or from the trainer's optimizer and is
 what ``drgs.splatting.projection`` and ``drgs.gaussians.sh`` read. It holds either numpy arrays (as
-files give them; no Dr.Jit backend is touched) or Dr.Jit arrays, and every stage derives its types
-from it.
+files give them; no Dr.Jit backend is touched) or Dr.Jit arrays, from which stages derive types.
 """
 
 from __future__ import annotations
@@ -74,8 +73,7 @@ class Gaussians(Generic[Tensor]):
         """Write a file, atomically, in the format that its suffix names: see ``drgs.io.formats``.
 
         Equal Gaussians give equal bytes. Formats whose y axis is up get them turned, as ``load``
-        expects them. Not saved: ``features``, and with a ``UserNote`` what the format has no room
-        for.
+        expects them. Not saved: ``features``, and what the format has no room for (a ``UserNote``).
 
         Raises ``drgs.core.errors.UserError`` (a ValueError) for another suffix, or where the format
         cannot hold them.
@@ -91,10 +89,7 @@ class Gaussians(Generic[Tensor]):
             temporary.write_bytes(content)
 
     def to_bytes(self, name: str) -> bytes:
-        """Return the content of a file in the format ``name`` of ``drgs.io.formats.FORMATS``.
-
-        As ``save`` writes it, which see.
-        """
+        """Return what ``save`` writes in the format ``name`` of ``drgs.io.formats.FORMATS``."""
         from drgs.io.formats import encode
 
         return encode(name, *self.arrays_for(name))
@@ -133,8 +128,7 @@ class Gaussians(Generic[Tensor]):
         world units; opacities: (N,); sh: (N, K, 3) coefficients, display space, of degree 0 to 3,
         K = (degree + 1)^2.
 
-        Raises ValueError for another shape, a scale that is not positive, or an opacity that is not
-        between 0 and 1.
+        Raises ValueError for another shape, scales not above 0, or opacities not between 0 and 1.
         """
         means, quats, scales, opacities, sh = (
             np.asarray(values, np.float32) for values in (means, quats, scales, opacities, sh)

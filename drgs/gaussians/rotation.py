@@ -72,8 +72,7 @@ def sh_rotation_matrices(rotation: np.ndarray, degree: int) -> list[np.ndarray]:
     rotation: R (3, 3), x' = R x. With c' for c, the function's value in a direction R d is what it
     was in d: sum_k Y_k(d') c'_k = sum_k Y_k(R^T d') c_k for all unit d'. float64.
     """
-    directions = _directions()
-    return _project_values(_basis(directions @ rotation, degree), degree)
+    return _project_values(_basis(_directions() @ rotation, degree), degree)
 
 
 @cache

@@ -148,8 +148,7 @@ def _attributes(g: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         f"{EXTENSION}:OPACITY": opacities[:, None],
     }
     harmonics = np.concatenate([g["sh0"], g["shN"]], axis=1)
-    for index, name in enumerate(_harmonics(harmonics.shape[1])):
-        attributes[name] = harmonics[:, index]
+    attributes |= zip(_harmonics(harmonics.shape[1]), np.moveaxis(harmonics, 1, 0), strict=True)
     return {
         name: np.ascontiguousarray(values, values.dtype if values.dtype == "u1" else "<f4")
         for name, values in attributes.items()

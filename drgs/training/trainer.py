@@ -228,9 +228,8 @@ class Trainer:
 
         def penalties(parameters: Mapping[str, dr.ArrayBase]) -> list[Float]:
             count = self.num_gaussians
-            found = checked_terms(
-                self.density, "penalties", self.density.penalties(parameters, count)
-            )
+            own = self.density.penalties(parameters, count)
+            found = checked_terms(self.density, "penalties", own)
             for term in self.terms:
                 found += checked_terms(term, "of_gaussians", [term.of_gaussians(parameters, count)])
             return found
@@ -250,11 +249,9 @@ class Trainer:
         loss, error = self.loss.with_squared_error(image, view.target)
         loss = checked_number(self.loss, "__call__", loss, dr.grad_enabled(image))
         for term in self.terms:
-            for one in checked_terms(term, "of_image", [term.of_image(image, view.target)]):
-                loss = loss + one
+            loss = sum(checked_terms(term, "of_image", [term.of_image(image, view.target)]), loss)
         for effect in self.effects:
-            for one in checked_terms(effect, "penalties", effect.penalties(view)):
-                loss = loss + one
+            loss = sum(checked_terms(effect, "penalties", effect.penalties(view)), loss)
         return image, loss, error
 
     def _pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
