@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 from typing_extensions import override
 
 from drgs.config.schema import FitConfig
-from drgs.config.section import ExtensibleSection, expectation, format_value
+from drgs.config.section import ExtensibleSection, expectation, format_value, set_value
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.file_kinds import describe_file
 from drgs.core.files import atomic_path, read_text
@@ -148,13 +148,7 @@ def _validate(values: dict, where: str, folder: Path, overrides: Iterable[str]) 
     for assignment in overrides:
         key, value = _parse_override(assignment)
         overridden.add(key)
-        *sections, leaf = key.split(".")
-        target = values
-        for name in sections:
-            if not isinstance(target.get(name), dict):
-                target[name] = {}
-            target = target[name]
-        target[leaf] = value
+        set_value(values, key, value)
     try:
         return FitConfig.model_validate(values)
     except ValidationError as error:
