@@ -55,9 +55,8 @@ def resident_memory() -> int:
 
 def format_bytes(count: float) -> str:
     """Format a number of bytes: ``3.2 GB``."""
-    unit, size = next(
-        ((u, s) for u, s in (("GB", 1e9), ("MB", 1e6)) if count >= 0.9995 * s), ("kB", 1e3)
-    )
+    larger = (("GB", 1e9), ("MB", 1e6))
+    unit, size = next((pair for pair in larger if count >= 0.9995 * pair[1]), ("kB", 1e3))
     return f"{float(f'{count / size:.3g}'):,g} {unit}"
 
 

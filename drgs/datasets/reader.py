@@ -124,9 +124,8 @@ class DatasetReader:
         used = [i for i in sorted({*split.train, *split.test}) if names[i] not in left]
         views = load_views(config, [frames[i] for i in used], _intrinsics, keeps, notices)
         views = dict(zip(used, views, strict=True))
-        train, test = (
-            tuple(views[i] for i in each if i in views) for each in (split.train, split.test)
-        )
+        train = tuple(views[i] for i in split.train if i in views)
+        test = tuple(views[i] for i in split.test if i in views)
         return make_dataset(config, photographs, train, test, split.name, f"({split.how})", notices)
 
     def image_files(self, config: DataConfig) -> Sequence[Path]:

@@ -96,9 +96,8 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
         raise ValueError("must be 4 x 4 numbers")
     matrix = np.array(rows, np.float64)
     rotation = matrix[:3, :3]
-    error = max(
-        np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - [0, 0, 0, 1]).max()
-    )
+    errors = rotation @ rotation.T - np.eye(3), matrix[3] - [0, 0, 0, 1]
+    error = max(np.abs(each).max() for each in errors)
     with np.errstate(all="ignore"):  # NumPy takes logarithms, of a determinant of 0 as well
         sign = np.linalg.det(rotation)
     if error > RIGID_TOLERANCE or sign < 0:

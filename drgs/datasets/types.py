@@ -103,7 +103,6 @@ class Dataset:
     def relative_to(self, origin: Origin) -> Dataset:
         """Return the same views with positions relative to ``origin``, world."""
         offset = np.subtract(self.origin, origin)
-        train, test = (
-            tuple(view.with_offset(offset) for view in views) for views in (self.train, self.test)
-        )
+        train = tuple(view.with_offset(offset) for view in self.train)
+        test = tuple(view.with_offset(offset) for view in self.test)
         return replace(self, train=train, test=test, origin=origin)

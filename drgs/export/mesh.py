@@ -177,9 +177,8 @@ def fuse(
     lane, t = dr.arange(mi.UInt32, int(np.prod(shape))), types_of(mi.Float)
     indices = lane // (shape[1] * shape[2]), lane // shape[2] % shape[1], lane % shape[2]
     sides = zip(indices, corner.tolist(), strict=True)
-    centers = t.Array3f(
-        [dr.fma(mi.Float(i) + 0.5, voxel, dr.opaque(mi.Float, c)) for i, c in sides]
-    )
+    columns = [dr.fma(mi.Float(i) + 0.5, voxel, dr.opaque(mi.Float, c)) for i, c in sides]
+    centers = t.Array3f(columns)
     total, weight, colored = (dr.zeros(mi.Float, len(lane)) for _ in range(3))
     color, truncation = dr.zeros(t.Array3f, len(lane)), dr.opaque(mi.Float, TRUNCATION * voxel)
     dr.eval(centers)

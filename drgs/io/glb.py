@@ -107,9 +107,8 @@ class Glb(FileFormat):
         means = document.values("POSITION", 3)
         scales = document.values(f"{EXTENSION}:SCALE", 3, 0)
         opacities = document.values(f"{EXTENSION}:OPACITY", 1, 0, 1)
-        harmonics = np.stack(
-            [document.values(name, 3).astype(np.float32) for name in _harmonics(count)], axis=1
-        )
+        columns = [document.values(name, 3).astype(np.float32) for name in _harmonics(count)]
+        harmonics = np.stack(columns, axis=1)
         quats = np.roll(document.values(f"{EXTENSION}:ROTATION", 4), 1, axis=1)
         moved, origin = recenter_means(means + document.translation)
         settings = document.rendered_with

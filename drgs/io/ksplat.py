@@ -101,9 +101,8 @@ def _read_sections(
         _refuse(path, 4, f"{num_sections:,} headers of sections", f"{len(content):,} bytes")
     for index in range(num_sections):
         at = HEADER_BYTES + index * SECTION_BYTES
-        count, room, size, num_buckets, block, stride, span, full, partial, degree = (
-            SECTION.unpack_from(content, at)
-        )
+        header = SECTION.unpack_from(content, at)
+        count, room, size, num_buckets, block, stride, span, full, partial, degree = header
         if degree > 3:
             _refuse(path, at + 40, "a degree of harmonics from 0 to 3", degree)
         row, centers = _row(level, degree), start + 4 * partial

@@ -132,13 +132,12 @@ class Spz(FileFormat):
         num, degree = len(g["means"]), round(np.sqrt(g["shN"].shape[1] + 1)) - 1
         bits = _fractional_bits(g["means"])
         flags = ANTIALIASED if rendered_with.get("antialiased") else 0
+        scales = (g["log_scales"].astype(np.float64) - LOG_SCALE_LOW) * SCALE_STEPS
         parts = (
             _packed_positions(g["means"], bits),
             round_to_uint32(opacities_from_logits(g["logit_opacities"]) * 255, 255),
             round_to_uint32((g["sh0"].astype(np.float64) * COLOR_SCALE + 0.5) * 255, 255),
-            round_to_uint32(
-                (g["log_scales"].astype(np.float64) - LOG_SCALE_LOW) * SCALE_STEPS, 255
-            ),
+            round_to_uint32(scales, 255),
             _packed_rotations(g["quats"]),
             _packed_harmonics(g["shN"]),
         )
