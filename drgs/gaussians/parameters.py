@@ -64,9 +64,8 @@ class Gaussians(Generic[Tensor]):
         extension, arrays, rendered_with = read_gaussians(path)
         up = extension.value.up and rendered_with.pop(UP, extension.value.up)
         origin = pop_origin(path, rendered_with)
-        gaussians = Gaussians(
-            **arrays, features=None, rendered_with=rendered_with or None, origin=origin
-        )
+        gaussians = Gaussians.from_arrays(arrays)
+        gaussians = replace(gaussians, rendered_with=rendered_with or None, origin=origin)
         return gaussians._rotate(Z_TO_Y.T) if up == "y" else gaussians
 
     def save(self, path: str | Path) -> None:
@@ -130,9 +129,8 @@ class Gaussians(Generic[Tensor]):
 
         Raises ValueError for another shape, scales not above 0, or opacities not between 0 and 1.
         """
-        means, quats, scales, opacities, sh = (
-            np.asarray(values, np.float32) for values in (means, quats, scales, opacities, sh)
-        )
+        given = (means, quats, scales, opacities, sh)
+        means, quats, scales, opacities, sh = (np.asarray(values, np.float32) for values in given)
         num = len(np.atleast_1d(means))
         shapes = {
             "means": (means, [(num, 3)]),

@@ -112,7 +112,8 @@ class Trainer:
         views_per_step = config.optimizer.views_per_step
         self.config, self.dataset, self.extent = config, dataset, dataset.extent
         self.comm = comm = comm or Communicator()
-        check_shardable(config, comm.size, gaussians.num_gaussians)
+        total = gaussians.num_gaussians
+        check_shardable(config, comm.size, total)
         self.effects = training_effects(config, dataset, parts.effects)
         self._parts, self._room = parts, room
         self.scene = make_scene(
@@ -141,9 +142,7 @@ class Trainer:
             from drgs.training.parallel.several_views import SeveralViews
 
             self.gradients = SeveralViews(comm, self.integrator, self.params, views_per_step)
-        self.population = make_population(
-            self.optimizer, self.extent, config.seed, comm, gaussians.num_gaussians
-        )
+        self.population = make_population(self.optimizer, self.extent, config.seed, comm, total)
         self.density = self._density_from({})
         self.watch = GradientWatch()
         self.iteration = 0  # the last one that is done
@@ -279,9 +278,8 @@ class Trainer:
                 for effect in self.effects
                 for name, values in effect.numbers_of(view.view).items()
             }
-            self.watch.append(
-                WatchedIteration(view.iteration, view.view.name, total, fault, numbers)
-            )
+            watched = WatchedIteration(view.iteration, view.view.name, total, fault, numbers)
+            self.watch.append(watched)
             results.append(replace(loss, loss=total))
         return results
 

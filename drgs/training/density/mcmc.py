@@ -131,9 +131,8 @@ class MarkovChain(DensityStrategy):
         config = self.settings
         if config.noise_lr == 0:
             return
-        means, quats, log_scales, logits = (
-            population.value(name) for name in ("means", "quats", "log_scales", "logit_opacities")
-        )
+        names = ("means", "quats", "log_scales", "logit_opacities")
+        means, quats, log_scales, logits = map(population.value, names)
         t = types_of(type(logits))
         strength = dr.opaque(t.Float, config.noise_lr * means_lr / self.extent**2)
         key = (dr.opaque(t.UInt32, v) for v in (iteration, population.seed))
