@@ -98,8 +98,7 @@ def time_in_turns(tasks: Sequence[Sequence[Callable[[], object]]], rounds: int) 
     """Return the seconds (R, F) of each task's F functions in R rounds.
 
     In turns, so that other load affects all tasks, and in random order, as caches depend on the
-    previous call. Slow tasks have fewer rounds. A first call, which compiles kernels, does not
-    count.
+    previous call. Slow tasks have fewer rounds. First calls, which compile kernels, do not count.
     """
 
     def call(task: Sequence[Callable[[], object]]) -> list[float]:

@@ -75,6 +75,5 @@ def mitsuba_sensor(camera: reference.Camera) -> dict[str, object]:
 def device_camera(camera: reference.Camera, float_type: type) -> Camera:
     """Return the camera as Dr.Jit scalars of ``float_type``."""
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    return Camera.create(
-        float_type, camera.rotation, camera.center, K, camera.width, camera.height, camera.near
-    )
+    size = camera.width, camera.height
+    return Camera.create(float_type, camera.rotation, camera.center, K, *size, camera.near)

@@ -61,8 +61,7 @@ def select_variant(name: str) -> None:
 def execution_settings(threads: int | None, debug: bool) -> Iterator[Callable[[], None]]:
     """Run the block on ``threads`` threads (None: as many as now), with range checks if ``debug``.
 
-    Yields a function, also called at the end, that raises :class:`UserError` after an access out of
-    range.
+    Yields a function, also called at the end: it raises :class:`UserError` if one was out of range.
     """
     with _thread_count(threads), denormals_flushed():
         if not debug:

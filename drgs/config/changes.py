@@ -11,20 +11,14 @@ from functools import reduce
 from typing import Any
 
 from drgs.config.schema import FitConfig
-from drgs.config.section import Section
+from drgs.config.section import Section, set_value
 
 
 def with_changes(config: FitConfig, changes: Mapping[str, object]) -> FitConfig:
     """Set values by names such as ``densify.every``, and check the result."""
     values = config.model_dump()
     for key, value in changes.items():
-        *sections, name = key.split(".")
-        target = values
-        for section in sections:
-            if target.get(section) is None:
-                target[section] = {}
-            target = target[section]
-        target[name] = value
+        set_value(values, key, value)
     return FitConfig.model_validate(values)
 
 

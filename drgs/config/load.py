@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 from typing_extensions import override
 
 from drgs.config.schema import FitConfig
-from drgs.config.section import ExtensibleSection, expectation, format_value
+from drgs.config.section import ExtensibleSection, expectation, format_value, set_value
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.file_kinds import describe_file
 from drgs.core.files import atomic_path, read_text
@@ -148,13 +148,7 @@ def _validate(values: dict, where: str, folder: Path, overrides: Iterable[str]) 
     for assignment in overrides:
         key, value = _parse_override(assignment)
         overridden.add(key)
-        *sections, leaf = key.split(".")
-        target = values
-        for name in sections:
-            if not isinstance(target.get(name), dict):
-                target[name] = {}
-            target = target[name]
-        target[leaf] = value
+        set_value(values, key, value)
     try:
         return FitConfig.model_validate(values)
     except ValidationError as error:
@@ -204,15 +198,12 @@ def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
     if kind in ("extra_forbidden", "invalid_key"):
         return f"{where}: unknown key {key}{did_you_mean(key, known_keys())}"
     if kind == "missing":
-        return f"{where}: {key} is missing: {_description(key)}"
+        field = _find(key)
+        assert field is not None, "pydantic names fields"
+        about = field.description or getattr(field.annotation, "__doc__", "")
+        return f"{where}: {key} is missing: {about}"
     if kind == "value_error" and not key:
         # A relation between values that may come from the file and from the command line.
         origin = f"{file} with --set {' '.join(sorted(overridden))}" if overridden else file
         return f"{origin}: {context['error']}"
     return f"{where}: {key} {expectation(item)}, got {format_value(item['input'])}"
-
-
-def _description(key: str) -> str:
-    field = _find(key)
-    assert field is not None, "pydantic names fields"
-    return field.description or getattr(field.annotation, "__doc__", "")

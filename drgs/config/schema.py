@@ -466,8 +466,7 @@ class FitConfig(ExtensibleSection):
 
     def _complete(self, section: str, changes: dict[str, Any]) -> None:
         """Set values of a section, which is frozen once it is validated."""
-        completed = getattr(self, section).model_copy(update=changes)
-        object.__setattr__(self, section, completed)
+        object.__setattr__(self, section, getattr(self, section).model_copy(update=changes))
 
     @model_validator(mode="after")
     def _check_relations(self) -> FitConfig:
@@ -487,8 +486,7 @@ class FitConfig(ExtensibleSection):
         _require(densify.start < densify.stop, expected, densify.start)
         views, at_once = optimizer.views, optimizer.views_per_step
         expected = f"optimizer.views must be a multiple of optimizer.views_per_step ({at_once}), "
-        is_usable = views <= at_once or views % at_once == 0
-        _require(is_usable, expected + "or not larger", views)
+        _require(views <= at_once or views % at_once == 0, expected + "or not larger", views)
         last = optimizer.means_lr_final
         expected = f"optimizer.means_lr_final must be <= optimizer.means_lr ({optimizer.means_lr})"
         _require(last <= optimizer.means_lr, expected, last)

@@ -223,6 +223,16 @@ def parse_json(text: str | bytes, where: str) -> Any:
         raise UserError(f"{where}not valid JSON: {one_line(error)}") from None
 
 
+def set_value(values: dict[str, Any], key: str, value: object) -> None:
+    """Set a value of nested mappings by its dotted name, such as ``densify.every``."""
+    *sections, name = key.split(".")
+    for section in sections:
+        if not isinstance(values.get(section), dict):
+            values[section] = {}
+        values = values[section]
+    values[name] = value
+
+
 def explain_error(error: ErrorDetails) -> str:
     """Return key, expectation and value of one of pydantic's errors on the content of a file."""
     parts = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]]

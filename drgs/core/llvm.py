@@ -116,8 +116,7 @@ def version_from_name(path: str | Path) -> Version | None:
         (r"libLLVM\.so\.(\d[\d.]*)", name),
         (r"/llvm[-@/](\d[\d.]*)", path),
     ):
-        match = re.search(pattern, text)
-        if match:
+        if match := re.search(pattern, text):
             return tuple(int(part) for part in match.group(1).strip(".").split("."))
     return None
 

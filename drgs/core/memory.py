@@ -36,8 +36,7 @@ _UNLIMITED_BYTES = 1 << 60
 
 def available_memory() -> int:
     """Return the bytes that the machine, control groups and the process's limit leave."""
-    machine = psutil.virtual_memory().available
-    return max(0, min(machine, _control_group_limit(), _process_limit()))
+    return max(0, min(psutil.virtual_memory().available, _control_group_limit(), _process_limit()))
 
 
 def release_unused_memory() -> None:
@@ -56,9 +55,8 @@ def resident_memory() -> int:
 
 def format_bytes(count: float) -> str:
     """Format a number of bytes: ``3.2 GB``."""
-    unit, size = next(
-        ((u, s) for u, s in (("GB", 1e9), ("MB", 1e6)) if count >= 0.9995 * s), ("kB", 1e3)
-    )
+    larger = (("GB", 1e9), ("MB", 1e6))
+    unit, size = next((pair for pair in larger if count >= 0.9995 * pair[1]), ("kB", 1e3))
     return f"{float(f'{count / size:.3g}'):,g} {unit}"
 
 
@@ -110,8 +108,7 @@ def too_large_reason(width: int, height: int, channels: int = 3, samples: int = 
             f"{asked} are too many for Dr.Jit, whose arrays end at 2^32 entries; at most "
             f"{MAX_LANES // widest:,} pixels fit"
         )
-    of_channels = CHANNEL_BYTES * (channels - 3)
-    of_pixel = IMAGE_BYTES + SAMPLE_BYTES * (samples - 1) + of_channels
+    of_pixel = IMAGE_BYTES + SAMPLE_BYTES * (samples - 1) + CHANNEL_BYTES * (channels - 3)
     available = _check_available(pixels * of_pixel, UNCHECKED_BYTES)
     if available is None:
         return None

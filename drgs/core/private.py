@@ -33,8 +33,7 @@ def bucket_order(buckets: UInt32, block_size: int, num_buckets: int) -> UInt32:
     Relies on ``dr.detail.block_mkperm`` being stable.
     """
     # The stub knows the types of each backend, not those of drjit.auto.
-    block_mkperm = cast("Callable[..., UInt32]", dr.detail.block_mkperm)
-    return block_mkperm(buckets, block_size, num_buckets)
+    return cast("Callable[..., UInt32]", dr.detail.block_mkperm)(buckets, block_size, num_buckets)
 
 
 def same_variables(tree: object, other: object) -> bool:

@@ -164,7 +164,10 @@ class Registry(Generic[T]):
 
     def names(self) -> list[str]:
         """Return the names of all extensions, shipped ones first."""
-        _load_any_kind()
+        for point in installed_points(ANY_KIND).values():
+            if point.value not in _loaded:
+                _load(point)
+                _loaded.add(point.value)
         shipped = self.shipped_names
         return [*shipped, *sorted({*self._extensions, *installed_points(self.group)} - {*shipped})]
 
@@ -250,10 +253,9 @@ def temporary_registrations() -> Iterator[None]:
         _loaded.intersection_update(loaded)
         for registry, extensions in before:
             # Modules of drgs are not imported again.
-            now = registry._extensions
-            names = shipped_modules(registry.group).keys() & now.keys()
-            shipped = {name: now[name] for name in names}
-            registry._extensions = {**shipped, **extensions}
+            shipped = shipped_modules(registry.group)
+            kept = {name: e for name, e in registry._extensions.items() if name in shipped}
+            registry._extensions = {**kept, **extensions}
 
 
 @contextmanager
@@ -346,13 +348,6 @@ def _find_points(
 
 
 _loaded: set[str] = set()  # entry points of any kind whose modules have been imported
-
-
-def _load_any_kind() -> None:
-    for point in installed_points(ANY_KIND).values():
-        if point.value not in _loaded:
-            _load(point)
-            _loaded.add(point.value)
 
 
 def _load(point: EntryPoint) -> ModuleType:

@@ -84,9 +84,8 @@ def _viewpoint_of(
     has_fl_y = values.fl_x is not None and values.fl_y is not None
     focal_y = scale_length("fl_y", "h", focal_length) if has_fl_y else focal
     if values.cx is not None and values.cy is not None:
-        cx, cy = (
-            scale_length(key, side, principal_point) for key, side in (("cx", "w"), ("cy", "h"))
-        )
+        cx = scale_length("cx", "w", principal_point)
+        cy = scale_length("cy", "h", principal_point)
     return Viewpoint(name, pose, focal, focal_y, cx, cy, width, height, lens, motion)
 
 

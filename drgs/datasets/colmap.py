@@ -123,8 +123,7 @@ def _images_and_files(
     images = sorted(model.images, key=lambda image: image.name)
     names = [image.name for image in images]
     places = [f"{folder}: image {one_line(name, 100)}" for name in names]
-    below = image_folder(config, model)
-    existing = find_files(below, folder, names, PHOTOGRAPHS, places, notes)
+    existing = find_files(image_folder(config, model), folder, names, PHOTOGRAPHS, places, notes)
     images = [image for image in images if image.name in existing]
     return images, [existing[image.name] for image in images]
 

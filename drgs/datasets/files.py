@@ -270,9 +270,8 @@ def _format_files(folder: Path, files: Sequence[Path]) -> str:
 def _mask_files(folder: Path) -> list[Path]:
     tops = [name for name in os.listdir(folder) if key_of(name) in MASK_FOLDERS]
     walks = (walk for top in tops for walk in os.walk(folder / top))
-    return _png_first(
-        Path(root, name) for root, _, names in walks for name in names if is_image(name)
-    )
+    images = (Path(root, name) for root, _, names in walks for name in names if is_image(name))
+    return _png_first(images)
 
 
 def _png_first(files: Iterable[Path]) -> list[Path]:

@@ -210,9 +210,8 @@ def composite(image: np.ndarray, background: tuple[float, float, float]) -> np.n
     if image.shape[2] == 3:
         return image
     *rgb, alpha = np.ascontiguousarray(np.moveaxis(image, 2, 0))  # faster than pixel by pixel
-    return np.stack(
-        [c * alpha + np.float32(b) * (1 - alpha) for c, b in zip(rgb, background, strict=True)]
-    ).transpose(1, 2, 0)
+    mixed = [c * alpha + np.float32(b) * (1 - alpha) for c, b in zip(rgb, background, strict=True)]
+    return np.stack(mixed).transpose(1, 2, 0)
 
 
 def downscale(image: np.ndarray, max_width: int | None) -> np.ndarray:

@@ -1,8 +1,7 @@
 """Readers of dataset folders: an extension point; and the views that every reader makes of frames.
 
 A reader is a subclass of :class:`DatasetReader`, registered by ``READERS.register(NAME)``. A
-configuration chooses it by ``data.type: NAME``; ``auto`` takes the first reader that recognizes the
-folder.
+configuration chooses it by ``data.type: NAME``; ``auto``, the first that recognizes the folder.
 """
 
 from __future__ import annotations
@@ -125,9 +124,8 @@ class DatasetReader:
         used = [i for i in sorted({*split.train, *split.test}) if names[i] not in left]
         views = load_views(config, [frames[i] for i in used], _intrinsics, keeps, notices)
         views = dict(zip(used, views, strict=True))
-        train, test = (
-            tuple(views[i] for i in each if i in views) for each in (split.train, split.test)
-        )
+        train = tuple(views[i] for i in split.train if i in views)
+        test = tuple(views[i] for i in split.test if i in views)
         return make_dataset(config, photographs, train, test, split.name, f"({split.how})", notices)
 
     def image_files(self, config: DataConfig) -> Sequence[Path]:
@@ -217,8 +215,7 @@ def read_photograph(read: Callable[[Path], T], file: Path) -> T:
     try:
         return read(file)
     except UserError as error:
-        name = Path(*file.parts[-2:])
-        raise UserError(f"{error}; or leave it out: --leave-out {name}") from None
+        raise UserError(f"{error}; or leave it out: --leave-out {Path(*file.parts[-2:])}") from None
 
 
 def map_on_threads(
@@ -399,8 +396,7 @@ class Notices:
             note_user(one_line(note, MAX_NOTE_CHARACTERS))
 
     def _name(self, file: Path) -> str:
-        is_below = file.is_relative_to(self._folder)
-        return str(file.relative_to(self._folder) if is_below else file)
+        return str(file.relative_to(self._folder) if file.is_relative_to(self._folder) else file)
 
     def _duplicate_notes(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
         """Return a note on duplicate photographs, or none."""

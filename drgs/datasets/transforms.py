@@ -96,9 +96,8 @@ def _opencv_pose(rows: list[list[float]]) -> np.ndarray:
         raise ValueError("must be 4 x 4 numbers")
     matrix = np.array(rows, np.float64)
     rotation = matrix[:3, :3]
-    error = max(
-        np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - [0, 0, 0, 1]).max()
-    )
+    errors = rotation @ rotation.T - np.eye(3), matrix[3] - [0, 0, 0, 1]
+    error = max(np.abs(each).max() for each in errors)
     with np.errstate(all="ignore"):  # NumPy takes logarithms, of a determinant of 0 as well
         sign = np.linalg.det(rotation)
     if error > RIGID_TOLERANCE or sign < 0:
@@ -338,8 +337,7 @@ def lens_of(frame: TransformsFrame) -> Lens | None:
     model, values = frame.values.camera_model, frame.values
     name = "opencv" if model is None else LENS_OF_MODEL.get(model, model)
     is_of_colmap = model is None or model in LENS_OF_MODEL
-    names = _coefficient_names(model)
-    given = {k: v for k in names if (v := getattr(values, k, None)) is not None}
+    given = {k: v for k in _coefficient_names(model) if (v := getattr(values, k, None)) is not None}
     for key, value in given.items():
         if type(value) not in (int, float) or not math.isfinite(value):
             got = one_line(json.dumps(value), 60)

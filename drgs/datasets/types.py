@@ -54,8 +54,7 @@ def evenly_spaced(items: Sequence[T], most: int) -> tuple[T, ...]:
 
 def _spread(views: Sequence[Viewpoint]) -> float:
     centers = np.stack([view.center for view in views])
-    distances = np.linalg.norm(centers - centers.mean(axis=0), axis=1)
-    return float(1.1 * distances.max())
+    return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -104,7 +103,6 @@ class Dataset:
     def relative_to(self, origin: Origin) -> Dataset:
         """Return the same views with positions relative to ``origin``, world."""
         offset = np.subtract(self.origin, origin)
-        train, test = (
-            tuple(view.with_offset(offset) for view in views) for views in (self.train, self.test)
-        )
+        train = tuple(view.with_offset(offset) for view in self.train)
+        test = tuple(view.with_offset(offset) for view in self.test)
         return replace(self, train=train, test=test, origin=origin)

@@ -73,9 +73,8 @@ def _node(
     low, high = means.min(axis=0), means.max(axis=0)
     axis = int(np.argmax(high - low))
     above = means[means[:, axis] > low[axis], axis]
-    boxes = np.concatenate(
-        [part.boxes[:, rows] for part, rows in zip(levels, members, strict=True)], axis=1
-    )
+    by_level = [part.boxes[:, rows] for part, rows in zip(levels, members, strict=True)]
+    boxes = np.concatenate(by_level, axis=1)
     bound = {"min": boxes[0].min(axis=0).tolist(), "max": boxes[1].max(axis=0).tolist()}
     if len(means) > LEAF_SIZE and len(above):
         middle = max(np.median(means[:, axis]), above.min())

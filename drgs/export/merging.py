@@ -42,7 +42,9 @@ def merge_down(gaussians: Gaussians[np.ndarray], count: int) -> Gaussians[np.nda
     while (surplus := len(means) - count) > 0:
         a, b = _neighbours(means)
         share = masses[a] / np.maximum(masses[a] + masses[b], np.finfo(np.float64).tiny)
-        merged = _mixed_covariance(means, covariances, a, b, share)
+        offset = means[a] - means[b]
+        between = np.einsum("n,ni,nj->nij", share * (1 - share), offset, offset)
+        merged = _mix(covariances, a, b, share) + between
         volumes = np.linalg.slogdet(covariances + floor)[1]
         cost = np.linalg.slogdet(merged + floor)[1] - _mix(volumes, a, b, share)
         cost = 0.5 * cost + _squared_differences(sh, a, b)
@@ -130,14 +132,6 @@ def _mix(values: np.ndarray, a: np.ndarray, b: np.ndarray, share: np.ndarray) ->
     """Return means of pairs of rows; share (M,): the weights of the first ones."""
     share = share.reshape(-1, *[1] * (values.ndim - 1))
     return share * values[a] + (1 - share) * values[b]
-
-
-def _mixed_covariance(
-    means: np.ndarray, covariances: np.ndarray, a: np.ndarray, b: np.ndarray, share: np.ndarray
-) -> np.ndarray:
-    offset = means[a] - means[b]
-    between = np.einsum("n,ni,nj->nij", share * (1 - share), offset, offset)
-    return _mix(covariances, a, b, share) + between
 
 
 def _surface(scales: np.ndarray) -> np.ndarray:

@@ -162,9 +162,8 @@ def volume_of(images: Sequence[DepthImage], size: int) -> tuple[np.ndarray, floa
     voxel = float((high - low).max()) / size
     border = np.ceil(TRUNCATION) + 1
     x, y, z = (np.ceil((high - low) / voxel) + 2 * border).astype(int).tolist()
-    require_memory(
-        f"--mesh-size {size}", VOXEL_BYTES * x * y * z, f"a volume of {x * y * z:,} voxels"
-    )
+    num = x * y * z
+    require_memory(f"--mesh-size {size}", VOXEL_BYTES * num, f"a volume of {num:,} voxels")
     return low - border * voxel, voxel, (x, y, z)
 
 
@@ -178,9 +177,8 @@ def fuse(
     lane, t = dr.arange(mi.UInt32, int(np.prod(shape))), types_of(mi.Float)
     indices = lane // (shape[1] * shape[2]), lane // shape[2] % shape[1], lane % shape[2]
     sides = zip(indices, corner.tolist(), strict=True)
-    centers = t.Array3f(
-        [dr.fma(mi.Float(i) + 0.5, voxel, dr.opaque(mi.Float, c)) for i, c in sides]
-    )
+    columns = [dr.fma(mi.Float(i) + 0.5, voxel, dr.opaque(mi.Float, c)) for i, c in sides]
+    centers = t.Array3f(columns)
     total, weight, colored = (dr.zeros(mi.Float, len(lane)) for _ in range(3))
     color, truncation = dr.zeros(t.Array3f, len(lane)), dr.opaque(mi.Float, TRUNCATION * voxel)
     dr.eval(centers)

@@ -2,8 +2,7 @@
 
 A :class:`Gaussians` comes from a file, from numpy arrays or from the trainer's optimizer and is
 what ``drgs.splatting.projection`` and ``drgs.gaussians.sh`` read. It holds either numpy arrays (as
-files give them; no Dr.Jit backend is touched) or Dr.Jit arrays, and every stage derives its types
-from it.
+files give them; no Dr.Jit backend is touched) or Dr.Jit arrays, from which stages derive types.
 """
 
 from __future__ import annotations
@@ -66,17 +65,15 @@ class Gaussians(Generic[Tensor]):
         extension, arrays, rendered_with = read_gaussians(path)
         up = extension.value.up and rendered_with.pop(UP, extension.value.up)
         origin = pop_origin(path, rendered_with)
-        gaussians = Gaussians(
-            **arrays, features=None, rendered_with=rendered_with or None, origin=origin
-        )
+        gaussians = Gaussians.from_arrays(arrays)
+        gaussians = replace(gaussians, rendered_with=rendered_with or None, origin=origin)
         return gaussians._rotate(Z_TO_Y.T) if up == "y" else gaussians
 
     def save(self, path: str | Path) -> None:
         """Write a file, atomically, in the format that its suffix names: see ``drgs.io.formats``.
 
         Equal Gaussians give equal bytes. Formats whose y axis is up get them turned, as ``load``
-        expects them. Not saved: ``features``, and with a ``UserNote`` what the format has no room
-        for.
+        expects them. Not saved: ``features``, and what the format has no room for (a ``UserNote``).
 
         Raises ``drgs.core.errors.UserError`` (a ValueError) for another suffix, or where the format
         cannot hold them.
@@ -93,10 +90,7 @@ class Gaussians(Generic[Tensor]):
             temporary.write_bytes(content)
 
     def to_bytes(self, name: str) -> bytes:
-        """Return the content of a file in the format ``name`` of ``drgs.io.formats.FORMATS``.
-
-        As ``save`` writes it, which see.
-        """
+        """Return what ``save`` writes in the format ``name`` of ``drgs.io.formats.FORMATS``."""
         from drgs.io.formats import encode
 
         return encode(name, *self.arrays_for(name))

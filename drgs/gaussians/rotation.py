@@ -72,8 +72,7 @@ def sh_rotation_matrices(rotation: np.ndarray, degree: int) -> list[np.ndarray]:
     rotation: R (3, 3), x' = R x. With c' for c, the function's value in a direction R d is what it
     was in d: sum_k Y_k(d') c'_k = sum_k Y_k(R^T d') c_k for all unit d'. float64.
     """
-    directions = _directions()
-    return _project_values(_basis(directions @ rotation, degree), degree)
+    return _project_values(_basis(_directions() @ rotation, degree), degree)
 
 
 @cache
@@ -81,8 +80,7 @@ def sh_rotation_generators(degree: int) -> list[list[np.ndarray]]:
     """Return derivatives of :func:`sh_rotation_matrices` at the identity, about x, y and z.
 
     A rotation by the small vector w turns c into c + sum_a w_a G_a c: the function's value at d is
-    then that at d - w x d, differentiated here by a complex step, which is exact for polynomials.
-    float64.
+    then that at d - w x d, differentiated here by a complex step, exact for polynomials. float64.
     """
     directions, step = _directions(), 1e-20
     ahead = [directions - 1j * step * np.cross(axis, directions) for axis in np.eye(3)]
@@ -119,7 +117,6 @@ def _basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """(N, (degree + 1)^2) values in unit directions (N, 3)."""
     x, y, z = directions.T
     # The formulas are the same for numpy arrays, also complex ones.
-    columns = sh_basis(cast("Array3f", SimpleNamespace(x=x, y=y, z=z)), degree)
-    return np.stack(
-        [np.broadcast_to(cast("np.ndarray", column), x.shape) for column in columns], axis=1
-    )
+    direction = cast("Array3f", SimpleNamespace(x=x, y=y, z=z))
+    columns = cast("list[np.ndarray]", sh_basis(direction, degree))
+    return np.stack([np.broadcast_to(column, x.shape) for column in columns], axis=1)

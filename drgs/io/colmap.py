@@ -86,8 +86,7 @@ class ColmapImage:
 POINT = np.dtype(
     [("positions", "<f8", 3), ("colors", "u1", 3), ("errors", "<f8"), ("track_lengths", "<i8")]
 )
-"""A point: world position, colour, mean distance of its observations (px; -1: not known), and their
-number."""
+"""A point: world position, colour, mean error (px; -1: not known) and number of observations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,9 +163,8 @@ def _cameras(records: Iterable[tuple]) -> dict[int, ColmapCamera]:
         _check_numbers(place, names, values)
         if number in cameras:
             raise UserError(f"{place}: each camera must be there once, got a second one {number}")
-        cameras[number] = ColmapCamera(
-            number, model, width, height, dict(zip(names, values, strict=True))
-        )
+        named = dict(zip(names, values, strict=True))
+        cameras[number] = ColmapCamera(number, model, width, height, named)
     return cameras
 
 

@@ -186,10 +186,8 @@ def _dequantize(path: str | Path, rows: Mapping[str, np.ndarray], word: str) -> 
     if word == "packed_color" and "min_r" not in (chunk.dtype.names or ()):
         return parts
     _require(path, "chunk", chunk, [f"{s}_{n}" for s in ("min", "max") for n in names], "f4")
-    low, high = (
-        np.column_stack([chunk[f"{side}_{name}"] for name in names]).astype(np.float64)
-        for side in ("min", "max")
-    )
+    low = np.column_stack([chunk[f"min_{name}"] for name in names]).astype(np.float64)
+    high = np.column_stack([chunk[f"max_{name}"] for name in names]).astype(np.float64)
     bad = np.argwhere(~(low <= high))
     if len(bad):
         row, axis = bad[0]

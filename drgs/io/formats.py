@@ -202,8 +202,7 @@ def _check_arrays(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
         raise ValueError(f"arrays must be {', '.join(SHAPES)}, got {', '.join(arrays)}")
     num = len(arrays["means"])
     for name, values in arrays.items():
-        expected = [(num, *shape) for shape in SHAPES[name]]
-        if not num or np.shape(values) not in expected:
+        if not num or np.shape(values) not in [(num, *shape) for shape in SHAPES[name]]:
             listed = " or ".join(map(str, SHAPES[name]))
             raise ValueError(f"{name}: {listed} per Gaussian expected, got {np.shape(values)}")
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused below

@@ -107,9 +107,8 @@ class Glb(FileFormat):
         means = document.values("POSITION", 3)
         scales = document.values(f"{EXTENSION}:SCALE", 3, 0)
         opacities = document.values(f"{EXTENSION}:OPACITY", 1, 0, 1)
-        harmonics = np.stack(
-            [document.values(name, 3).astype(np.float32) for name in _harmonics(count)], axis=1
-        )
+        columns = [document.values(name, 3).astype(np.float32) for name in _harmonics(count)]
+        harmonics = np.stack(columns, axis=1)
         quats = np.roll(document.values(f"{EXTENSION}:ROTATION", 4), 1, axis=1)
         moved, origin = recenter_means(means + document.translation)
         settings = document.rendered_with
@@ -148,8 +147,7 @@ def _attributes(g: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         f"{EXTENSION}:OPACITY": opacities[:, None],
     }
     harmonics = np.concatenate([g["sh0"], g["shN"]], axis=1)
-    for index, name in enumerate(_harmonics(harmonics.shape[1])):
-        attributes[name] = harmonics[:, index]
+    attributes |= zip(_harmonics(harmonics.shape[1]), np.moveaxis(harmonics, 1, 0), strict=True)
     return {
         name: np.ascontiguousarray(values, values.dtype if values.dtype == "u1" else "<f4")
         for name, values in attributes.items()

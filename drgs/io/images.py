@@ -216,12 +216,10 @@ def write_png(path: Path, image: np.ndarray, text: Mapping[str, str] | None = No
 
     text: to be stored with it, by name.
     """
-    options = {}
-    if text:
-        options["pnginfo"] = chunks = PngImagePlugin.PngInfo()
-        for name, words in text.items():
-            chunks.add_text(name, words)
-    _write(path, encode(image, "png", **options))
+    chunks = PngImagePlugin.PngInfo()
+    for name, words in (text or {}).items():
+        chunks.add_text(name, words)
+    _write(path, encode(image, "png", pnginfo=chunks))
 
 
 def write_exr(path: Path, bitmap: mi.Bitmap) -> None:

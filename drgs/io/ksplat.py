@@ -66,16 +66,14 @@ def _read(path: Path) -> Arrays:
         _refuse(path, 16, f"the number of Gaussians in sections, {found:,}, at least 1", num)
     width = max(rows["sh"].shape[1] for rows, _ in sections)
     require_scene_memory(path, num, 1 + width // 3)
-    rows = {
-        name: np.concatenate([rows[name] for rows, _ in sections])
-        for name in ("scale", "quat", "rgba")
-    }
+    names = ("scale", "quat", "rgba")
+    scale, quat, rgba = (np.concatenate([rows[name] for rows, _ in sections]) for name in names)
     return {
         "means": np.concatenate([means for _, means in sections]),
-        "quats": rows["quat"].astype(np.float32),
-        "log_scales": log_scales_from_scales(np.abs(rows["scale"].astype(np.float32))),
-        "logit_opacities": logits_from_opacities(rows["rgba"][:, 3] / 255),
-        "sh0": sh0_from_colors(rows["rgba"][:, :3] / 255),
+        "quats": quat.astype(np.float32),
+        "log_scales": log_scales_from_scales(np.abs(scale.astype(np.float32))),
+        "logit_opacities": logits_from_opacities(rgba[:, 3] / 255),
+        "sh0": sh0_from_colors(rgba[:, :3] / 255),
         "shN": np.concatenate([_harmonics(r["sh"], level, bounds, width) for r, _ in sections]),
     }
 
@@ -103,9 +101,8 @@ def _read_sections(
         _refuse(path, 4, f"{num_sections:,} headers of sections", f"{len(content):,} bytes")
     for index in range(num_sections):
         at = HEADER_BYTES + index * SECTION_BYTES
-        count, room, size, num_buckets, block, stride, span, full, partial, degree = (
-            SECTION.unpack_from(content, at)
-        )
+        header = SECTION.unpack_from(content, at)
+        count, room, size, num_buckets, block, stride, span, full, partial, degree = header
         if degree > 3:
             _refuse(path, at + 40, "a degree of harmonics from 0 to 3", degree)
         row, centers = _row(level, degree), start + 4 * partial

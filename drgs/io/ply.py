@@ -119,19 +119,18 @@ class Ply(FileFormat):
     @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         """Return a file as the 3DGS reference writes it, binary little-endian."""
-        g = gaussians
-        num, num_rest = len(g["means"]), 3 * g["shN"].shape[1]
+        num, num_rest = len(gaussians["means"]), 3 * gaussians["shN"].shape[1]
         columns = {
-            POSITION: g["means"],
+            POSITION: gaussians["means"],
             NORMAL: np.zeros((num, 3)),
-            SH0: g["sh0"].reshape(num, 3),
-            _rest(num_rest): g["shN"].transpose(0, 2, 1).reshape(num, num_rest),
-            OPACITY: g["logit_opacities"].reshape(num, 1),
-            SCALE: g["log_scales"],
-            ROTATION: g["quats"],
+            SH0: gaussians["sh0"].reshape(num, 3),
+            _rest(num_rest): gaussians["shN"].transpose(0, 2, 1).reshape(num, num_rest),
+            OPACITY: gaussians["logit_opacities"].reshape(num, 1),
+            SCALE: gaussians["log_scales"],
+            ROTATION: gaussians["quats"],
         }
-        if "smoothing" in g:
-            columns[SMOOTHING] = g["smoothing"].reshape(num, 1)
+        if "smoothing" in gaussians:
+            columns[SMOOTHING] = gaussians["smoothing"].reshape(num, 1)
         rows = np.concatenate(list(columns.values()), axis=1).astype("<f4")
         vertex = rows.view([(name, "<f4") for names in columns for name in names]).reshape(num)
         return encode_elements({"vertex": vertex}, rendered_with)

@@ -99,9 +99,8 @@ class Sog(FileFormat):
         low, high = (_pixels(path, n, num)[:, :3].astype(np.uint16) for n in meta.means.files)
         mins, maxs = np.array(meta.means.mins), np.array(meta.means.maxs)
         logs = mins + (low | high << 8) / POSITION_LEVELS * (maxs - mins)
-        quats, scales, sh0 = (
-            _pixels(path, part.files[0], num) for part in (meta.quats, meta.scales, meta.sh0)
-        )
+        parts = (meta.quats, meta.scales, meta.sh0)
+        quats, scales, sh0 = (_pixels(path, part.files[0], num) for part in parts)
         largest = quats[:, 3].astype(np.intp) - FIRST_TAG
         others = (quats[:, :3] / 127.5 - 1) / np.sqrt(2)
         arrays = {
@@ -185,9 +184,8 @@ def encode_files(g: Arrays, rendered_with: Mapping[str, Scalar]) -> dict[str, by
         rows[: len(palette)] = entries
         images["shN_centroids"] = rows.reshape(-1, PALETTE_COLUMNS * NUM_HARMONICS[bands], 3)
         high_bytes, low_bytes = np.divmod(labels, LEVELS)
-        images["shN_labels"] = _per_gaussian(
-            np.column_stack([low_bytes, high_bytes, np.zeros_like(labels)])
-        )
+        columns = [low_bytes, high_bytes, np.zeros_like(labels)]
+        images["shN_labels"] = _per_gaussian(np.column_stack(columns))
         meta["shN"] = {"count": len(palette), "bands": bands, "codebook": codebook.tolist()}
     for name in images:
         part = meta[name.partition("_")[0]]

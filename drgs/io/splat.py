@@ -61,19 +61,18 @@ class Splat(FileFormat):
 
     @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
-        g = gaussians
-        if (extent := np.abs(g["means"]).max()) > MAX_NUMBER:
+        if (extent := np.abs(gaussians["means"]).max()) > MAX_NUMBER:
             raise UserError(
                 f"the format splat holds positions of at most {MAX_NUMBER:g}, got {extent:g}; crop "
                 "or scale the scene"
             )
-        opacities = opacities_from_logits(g["logit_opacities"])
-        log_scales = g["log_scales"].astype(np.float64)
+        opacities = opacities_from_logits(gaussians["logit_opacities"])
+        log_scales = gaussians["log_scales"].astype(np.float64)
         importance = log_scales.sum(axis=1) + np.log(opacities)
         rows = np.empty(len(opacities), ROW)
-        rows["mean"] = g["means"]
+        rows["mean"] = gaussians["means"]
         rows["scale"] = np.exp(np.minimum(log_scales, np.log(MAX_NUMBER))).astype(np.float32)
-        rgba = np.column_stack([colors_from_sh0(g["sh0"]), opacities])
+        rgba = np.column_stack([colors_from_sh0(gaussians["sh0"]), opacities])
         rows["rgba"] = round_to_uint32(rgba * 255, 255)
-        rows["quat"] = round_to_uint32(normalize_quaternions(g["quats"]) * 128 + 128, 255)
+        rows["quat"] = round_to_uint32(normalize_quaternions(gaussians["quats"]) * 128 + 128, 255)
         return rows[np.argsort(-importance, kind="stable")].tobytes()

@@ -132,13 +132,12 @@ class Spz(FileFormat):
         num, degree = len(g["means"]), round(np.sqrt(g["shN"].shape[1] + 1)) - 1
         bits = _fractional_bits(g["means"])
         flags = ANTIALIASED if rendered_with.get("antialiased") else 0
+        scales = (g["log_scales"].astype(np.float64) - LOG_SCALE_LOW) * SCALE_STEPS
         parts = (
             _packed_positions(g["means"], bits),
             round_to_uint32(opacities_from_logits(g["logit_opacities"]) * 255, 255),
             round_to_uint32((g["sh0"].astype(np.float64) * COLOR_SCALE + 0.5) * 255, 255),
-            round_to_uint32(
-                (g["log_scales"].astype(np.float64) - LOG_SCALE_LOW) * SCALE_STEPS, 255
-            ),
+            round_to_uint32(scales, 255),
             _packed_rotations(g["quats"]),
             _packed_harmonics(g["shN"]),
         )
@@ -179,8 +178,7 @@ def _packed_positions(means: np.ndarray, bits: int) -> np.ndarray:
     """(N, 3, 3) bytes, the lowest first."""
     steps = np.floor(means.astype(np.float64) * 2.0**bits + 0.5)
     limit = 2 ** (POSITION_BITS - 1)
-    steps = np.clip(steps, -limit, limit - 1).astype("<i4")
-    return steps.view("u1").reshape(-1, 3, 4)[:, :, :3]
+    return np.clip(steps, -limit, limit - 1).astype("<i4").view("u1").reshape(-1, 3, 4)[:, :, :3]
 
 
 def _packed_rotations(quats: np.ndarray) -> np.ndarray:
@@ -230,8 +228,7 @@ def _unpacked_rotations(rows: np.ndarray, version: int) -> np.ndarray:
     """(N, 4) wxyz of (N, 4) bytes, or of version 2's (N, 3)."""
     if version < 3:
         xyz = rows / 127.5 - 1
-        w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(axis=1)))
-        return np.column_stack([w, xyz])
+        return np.column_stack([np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(axis=1))), xyz])
     words = np.ascontiguousarray(rows).view("<u4")[:, 0]
     fields = words[:, None] >> np.array([20, 10, 0], np.uint32)
     sizes = (fields & np.uint32(QUATERNION_LEVELS)) / (QUATERNION_LEVELS * np.sqrt(2))

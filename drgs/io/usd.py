@@ -75,7 +75,6 @@ class Usd(FileFormat):
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         """Return a binary USD file, in which the origin is the translation of the prim."""
         Sdf, Usd, UsdGeom, UsdVol, Vt = _import_openusd("Sdf", "Usd", "UsdGeom", "UsdVol", "Vt")
-        g = gaussians
         stage = Usd.Stage.CreateInMemory()
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -85,11 +84,11 @@ class Usd(FileFormat):
         if origin != WORLD:
             UsdGeom.Xformable(splats).AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(origin)
         Usd.ColorSpaceAPI.Apply(splats.GetPrim()).CreateColorSpaceNameAttr(COLOR_SPACE)
-        means = _float32(g["means"])
-        scales = _float32(np.exp(np.minimum(g["log_scales"].astype(np.float64), 80)))
-        quats_xyzw = _float32(np.roll(normalize_quaternions(g["quats"]), -1, axis=1))
-        opacities = _float32(opacities_from_logits(g["logit_opacities"]))
-        harmonics = np.concatenate([g["sh0"], g["shN"]], axis=1)
+        means = _float32(gaussians["means"])
+        scales = _float32(np.exp(np.minimum(gaussians["log_scales"].astype(np.float64), 80)))
+        quats_xyzw = _float32(np.roll(normalize_quaternions(gaussians["quats"]), -1, axis=1))
+        opacities = _float32(opacities_from_logits(gaussians["logit_opacities"]))
+        harmonics = np.concatenate([gaussians["sh0"], gaussians["shN"]], axis=1)
         splats.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(means))
         splats.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(quats_xyzw))
         splats.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))

@@ -1,4 +1,1 @@
-"""Find out where photographs were taken.
-
-By COLMAP's structure from motion.
-"""
+"""Find out where photographs were taken, by COLMAP's structure from motion."""

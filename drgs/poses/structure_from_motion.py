@@ -137,9 +137,8 @@ def photographs_in(folder: Path) -> tuple[Path, list[str]]:
     images = without_masks([p for p in images if is_image(p.name) and p.is_file()])
     images.sort(key=_numeric_order)
     files = [path for path in images if path.suffix.lower() in SUFFIXES]
-    others = format_names(
-        [path.relative_to(photographs) for path in images if path not in set(files)]
-    )
+    unread = [path for path in images if path.suffix.lower() not in SUFFIXES]
+    others = format_names([path.relative_to(photographs) for path in unread])
     if not files:
         got = f"{others}, which COLMAP does not read; convert them to JPEG" if others else "none"
         if not others and (below := explain_photographs(folder)):
@@ -229,9 +228,8 @@ def _reconstruct_in_child(
     pycolmap = require_module("pycolmap", "colmap", "structure from motion")
     pycolmap.logging.minloglevel = 3  # errors are reported below
     try:
-        model, count = _Reconstruction(
-            pycolmap, folder, photographs, dataset, names, settings, watch
-        ).largest()
+        task = _Reconstruction(pycolmap, folder, photographs, dataset, names, settings, watch)
+        model, count = task.largest()
         written = folder / "model"
         written.mkdir()
         model.write_binary(written)

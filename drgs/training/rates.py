@@ -57,8 +57,7 @@ class LearningRates:
     """The rates of all parameters of the Gaussians, over the iterations.
 
     The means' rate decays from the start; the others decay to ``decay`` times their initial value,
-    by a constant factor per iteration, after the share ``decay_from`` of the iterations that follow
-    coarse stages.
+    by a constant factor per iteration, after a share ``decay_from`` of those after coarse stages.
     """
 
     means: ExponentialDecay
@@ -83,9 +82,8 @@ def rates_over_time(config: FitConfig, extent: float) -> LearningRates:
     """
     optimizer = config.optimizer
     longer = math.sqrt(optimizer.views_per_step)
-    first, last = (
-        longer * rate * extent for rate in (optimizer.means_lr, optimizer.means_lr_final)
-    )
+    first = longer * optimizer.means_lr * extent
+    last = longer * optimizer.means_lr_final * extent
     others = {
         "quats": longer * optimizer.quats_lr,
         "log_scales": longer * optimizer.scales_lr,

@@ -112,7 +112,8 @@ class Trainer:
         views_per_step = config.optimizer.views_per_step
         self.config, self.dataset, self.extent = config, dataset, dataset.extent
         self.comm = comm = comm or Communicator()
-        check_shardable(config, comm.size, gaussians.num_gaussians)
+        total = gaussians.num_gaussians
+        check_shardable(config, comm.size, total)
         self.effects = training_effects(config, dataset, parts.effects)
         self._parts, self._room = parts, room
         self.scene = make_scene(
@@ -141,9 +142,7 @@ class Trainer:
             from drgs.training.parallel.several_views import SeveralViews
 
             self.gradients = SeveralViews(comm, self.integrator, self.params, views_per_step)
-        self.population = make_population(
-            self.optimizer, self.extent, config.seed, comm, gaussians.num_gaussians
-        )
+        self.population = make_population(self.optimizer, self.extent, config.seed, comm, total)
         self.density = self._density_from({})
         self.watch = GradientWatch()
         self.iteration = 0  # the last one that is done
@@ -228,9 +227,8 @@ class Trainer:
 
         def penalties(parameters: Mapping[str, dr.ArrayBase]) -> list[Float]:
             count = self.num_gaussians
-            found = checked_terms(
-                self.density, "penalties", self.density.penalties(parameters, count)
-            )
+            own = self.density.penalties(parameters, count)
+            found = checked_terms(self.density, "penalties", own)
             for term in self.terms:
                 found += checked_terms(term, "of_gaussians", [term.of_gaussians(parameters, count)])
             return found
@@ -250,11 +248,9 @@ class Trainer:
         loss, error = self.loss.with_squared_error(image, view.target)
         loss = checked_number(self.loss, "__call__", loss, dr.grad_enabled(image))
         for term in self.terms:
-            for one in checked_terms(term, "of_image", [term.of_image(image, view.target)]):
-                loss = loss + one
+            loss = sum(checked_terms(term, "of_image", [term.of_image(image, view.target)]), loss)
         for effect in self.effects:
-            for one in checked_terms(effect, "penalties", effect.penalties(view)):
-                loss = loss + one
+            loss = sum(checked_terms(effect, "penalties", effect.penalties(view)), loss)
         return image, loss, error
 
     def _pixel_weights(self, iteration: int) -> Mapping[str, PixelWeight]:
@@ -282,9 +278,8 @@ class Trainer:
                 for effect in self.effects
                 for name, values in effect.numbers_of(view.view).items()
             }
-            self.watch.append(
-                WatchedIteration(view.iteration, view.view.name, total, fault, numbers)
-            )
+            watched = WatchedIteration(view.iteration, view.view.name, total, fault, numbers)
+            self.watch.append(watched)
             results.append(replace(loss, loss=total))
         return results
 

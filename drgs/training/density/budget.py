@@ -195,9 +195,8 @@ def halves(population: Population, rows: np.ndarray) -> dict[str, dr.ArrayBase]:
     offsets = np.zeros((len(twice), 3))
     offsets[np.arange(len(twice)), longest] = np.repeat([HALF_OFFSET, -HALF_OFFSET], len(rows))
     factors = np.where(offsets != 0, HALF_LONG_SCALE, HALF_SHORT_SCALE)
-    opacities = np.clip(
-        HALF_OPACITY * expit(population.host("logit_opacities")[twice]), *HALF_OPACITY_RANGE
-    )
+    opacities = HALF_OPACITY * expit(population.host("logit_opacities")[twice])
+    opacities = np.clip(opacities, *HALF_OPACITY_RANGE)
 
     t = types_of(type(new["logit_opacities"]))
     log_factors = t.TensorXf(from_host(t.Float, np.log(factors)), factors.shape)

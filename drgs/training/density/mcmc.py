@@ -131,9 +131,8 @@ class MarkovChain(DensityStrategy):
         config = self.settings
         if config.noise_lr == 0:
             return
-        means, quats, log_scales, logits = (
-            population.value(name) for name in ("means", "quats", "log_scales", "logit_opacities")
-        )
+        names = ("means", "quats", "log_scales", "logit_opacities")
+        means, quats, log_scales, logits = map(population.value, names)
         t = types_of(type(logits))
         strength = dr.opaque(t.Float, config.noise_lr * means_lr / self.extent**2)
         key = (dr.opaque(t.UInt32, v) for v in (iteration, population.seed))
@@ -230,11 +229,10 @@ def _copies(
     # Of each new row, the place of its source among those that were drawn.
     source = np.append(np.arange(len(drawn)), np.searchsorted(drawn, copied))
     t = types_of(type(rows["logit_opacities"]))
-    log_factors = np.repeat(np.log(factors)[source], 3)
+    log_factors = from_host(t.Float, np.repeat(np.log(factors)[source], 3))
+    log_scales = rows["log_scales"]
     rows["logit_opacities"] = from_host(t.Float, logit(shared)[source])
-    rows["log_scales"] = rows["log_scales"] + t.TensorXf(
-        from_host(t.Float, log_factors), rows["log_scales"].shape
-    )
+    rows["log_scales"] = log_scales + t.TensorXf(log_factors, log_scales.shape)
     return drawn, rows
 
 

@@ -102,8 +102,7 @@ def concatenate(parts: Sequence[SplatTable]) -> SplatTable:
         columns = zip(*(rows.blocks for rows in each), strict=True)
         return Rows(tuple(dr.concat(list(blocks)) for blocks in columns), each[0].width)
 
-    boxes, rows = (
-        concatenate_rows([getattr(part, name) for part in parts]) for name in ("boxes", "rows")
-    )
+    boxes = concatenate_rows([part.boxes for part in parts])
+    rows = concatenate_rows([part.rows for part in parts])
     depths = dr.concat([part.depths for part in parts])
     return SplatTable(boxes, rows, depths, parts[0].num_features, parts[0].num_keys)

@@ -162,12 +162,10 @@ class ShardedPopulation(Population):
                 appended = np.array(append[name])[first:end]
             rows = np.concatenate([move(np.array(dr.detach(value))), appended])
             none = np.zeros_like(appended)
+            moved = (move(np.array(moment).reshape(value.shape)) for moment in moments)
             first_moment, second_moment = (
-                from_host(
-                    type(moment),
-                    np.concatenate([move(np.array(moment).reshape(value.shape)), none]),
-                )
-                for moment in moments
+                from_host(type(moment), np.concatenate([kept_rows, none]))
+                for moment, kept_rows in zip(moments, moved, strict=True)
             )
             new_value = _on_device(value, rows)
             dr.make_opaque(new_value, first_moment, second_moment)
