@@ -61,20 +61,21 @@ def to_film(view: Viewpoint, position: Columns) -> tuple[np.ndarray, np.ndarray,
 
 
 def shown_points(
-    view: Viewpoint, points: Columns, spacing: np.ndarray
+    view: Viewpoint, points: Columns, spacing: np.ndarray, pixel_width: float = PIXEL_WIDTH
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Return the points in the image that no clearly nearer point hides.
 
     points: world; spacing: (N,) scene units, of each to its neighbours. Returned are their indices
-    (M,), the rows and columns of their pixels, and their depths (M,), scene units. On a surface
-    that turns away from the camera, points hide each other.
+    (M,), the rows and columns of their pixels, and their depths (M,), scene units. pixel_width: of
+    the z-buffer, in ``spacing``. On a surface that turns away from the camera, points hide each
+    other.
     """
     u, v, depth = to_film(view, to_camera(view, points))
     on_film = (depth > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
     indices = np.flatnonzero(on_film)
     u, v, depth, spacing = (values[indices] for values in (u, v, depth, spacing))
     if len(indices):
-        pixel = max(1.0, PIXEL_WIDTH * view.fx * float(np.median(spacing / depth)))
+        pixel = max(1.0, pixel_width * view.fx * float(np.median(spacing / depth)))
         cell = np.floor(v / pixel).astype(np.int64) * (int(view.width / pixel) + 1)
         cell += np.floor(u / pixel).astype(np.int64)
         nearest = np.full(cell.max() + 1, np.inf)

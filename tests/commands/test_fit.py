@@ -262,7 +262,7 @@ def test_photographs_that_are_left_out_are_not_fitted(tmp_path, monkeypatch):
     without_images(monkeypatch)
     project, out = write_project(tmp_path), tmp_path / "out"
     text = assert_fits(project, "--out", out, "--leave-out", "train/r_1").stdout
-    assert "1 of these left out" in text and "2 views to train on, 2 of split 'test'" in text
+    assert "; 1 left out" in text and "2 views to train on, 2 of split 'test'" in text
     assert yaml.safe_load((out / "config.yml").read_text())["data"]["leave_out"] == ["train/r_1"]
     message = "data.leave_out: "
     words = (project, "--out", tmp_path / "other", "--leave-out")

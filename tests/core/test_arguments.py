@@ -67,7 +67,9 @@ PUBLIC = {
 
 
 @pytest.mark.parametrize("place", PUBLIC)
-@pytest.mark.parametrize("value", [b"x", [7], object(), 1j], ids=repr)
+@pytest.mark.parametrize(
+    "value", [b"x", [7], object(), 1j], ids=["bytes", "list", "object", "complex"]
+)
 def test_arguments_of_other_types(place, value):
     where, name = place.split()
     with pytest.raises(UserError) as error:
