@@ -191,7 +191,7 @@ def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:
         if len(more) < len(args.overrides) or any(given):
             raise UserError(
                 f"--resume: takes its configuration from {args.resume / CONFIG}: leave out --out, "
-                "--set (but for iterations=N), --leave-out, --budget and --overwrite"
+                "--set, --leave-out, --budget and --overwrite; --set iterations=N alone goes on"
             )
         config = load_moved_config(args.resume, data)
         if more and not has_results(args.resume):

@@ -374,7 +374,7 @@ def test_a_fit_that_has_ended_goes_on_from_its_gaussians(ended):
 def test_what_a_fit_does_not_go_on_with_is_refused(stopped, ended):
     refused = {
         (stopped, "iterations=99"): "has not ended yet; leave it out",
-        (ended, "seed=7"): "leave out --out, --set (but for iterations=N)",
+        (ended, "seed=7"): "--set iterations=N alone goes on",
         (ended, "iterations=x"): "iterations must be an integer, got 'x'",
     }
     for (folder, text), message in refused.items():
