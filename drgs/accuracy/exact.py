@@ -53,7 +53,6 @@ from drgs.accuracy.peaks import (
     MAX_EXPONENT,
     UNBOUNDED_OUTLINE,
     AffineDepths,
-    OutlinedFalloff,
     bounding_cone,
     seen_along,
 )
@@ -125,7 +124,7 @@ class RayFootprint(MicroTileFootprint):
 
 
 @dataclass(frozen=True)
-class RayFalloff(OutlinedFalloff):
+class RayFalloff(GaussianFalloff):
     """alpha = o exp(-rho^2 / 2), with rho^2 the smallest along the pixel's ray.
 
     Geometry: that of :class:`GaussianFalloff`, then g (2), h; all as :func:`exact_shape` gives
@@ -265,6 +264,19 @@ class RayFalloff(OutlinedFalloff):
             scale * z_y,
             math.log(2) / WHITENING_SCALE**2 * bb,
         ]
+
+    @override
+    def bounds(
+        self, splats: Splats2D, geometry: list[Float], reach: Float
+    ) -> tuple[Array2f, Array2f]:
+        x, y, p, r, s = self.outline(geometry, reach)
+        Array2f = types_of(type(p)).Array2f
+        half_sizes = Array2f(dr.sqrt(1 + dr.square(r / s)) / p, 1 / s)
+        return Array2f(x, y), dr.sqrt(reach) * half_sizes
+
+    @override
+    def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
+        return super().pack_tangents(geometry, tangents[:6]) + list(tangents[6:])
 
     @override
     def tangent(

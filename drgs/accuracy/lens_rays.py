@@ -46,7 +46,6 @@ from drgs.accuracy.peaks import (
     MAX_EXPONENT,
     UNBOUNDED_OUTLINE,
     AffineDepths,
-    OutlinedFalloff,
     bounding_cone,
     seen_along,
 )
@@ -149,7 +148,7 @@ class LensRayFootprint(MicroTileFootprint):
 
 
 @dataclass(frozen=True)
-class LensRayFalloff(OutlinedFalloff):
+class LensRayFalloff(GaussianFalloff):
     """alpha = o exp(-rho^2 / 2) along each pixel's ray, behind any lens.
 
     Geometry: that of :class:`GaussianFalloff`; then J (6), n (3), kappa (2) and h, to base 2, and
@@ -338,6 +337,19 @@ class LensRayFalloff(OutlinedFalloff):
             return derivatives
         o1, o2, b = sums[10:]
         return [*derivatives, *(math.log(2) * (o1 * splat.e1 + o2 * splat.e2 - b * splat.a))]
+
+    @override
+    def bounds(
+        self, splats: Splats2D, geometry: list[Float], reach: Float
+    ) -> tuple[Array2f, Array2f]:
+        x, y, p, r, s = self.outline(geometry, reach)
+        t = types_of(type(p))
+        half_sizes = t.Array2f(dr.sqrt(1 + dr.square(r / s)) / p, 1 / s)
+        return t.Array2f(x, y), dr.sqrt(reach) * half_sizes
+
+    @override
+    def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
+        return super().pack_tangents(geometry, tangents[:6]) + list(tangents[6:])
 
     @override
     def tangent(

@@ -11,9 +11,8 @@ import drjit as dr
 from typing_extensions import override
 
 from drgs.cameras.camera import Camera
-from drgs.core.arrays import types_of
 from drgs.core.constants import WHITENING_SCALE
-from drgs.core.types import Array2f, Array3f, Bool, Float
+from drgs.core.types import Array3f, Bool, Float
 from drgs.splatting.footprint import GaussianFalloff, MicroTileFootprint
 from drgs.splatting.grid import Lanes, TileGrid, load_pixels
 from drgs.splatting.projection import (
@@ -67,23 +66,6 @@ def seen_along(
     h = dr.square(dr.dot(p * minors, n)) + low_pass_s * dr.squared_norm(dr.cross(m0, n))
     h += low_pass * dr.square(p) * (dr.squared_norm(minors_n) + low_pass_s * dr.squared_norm(n))
     return film, (kx, ky), h
-
-
-class OutlinedFalloff(GaussianFalloff):
-    """A falloff along rays, whose bounds are those of its outline; the base class."""
-
-    @override
-    def bounds(
-        self, splats: Splats2D, geometry: list[Float], reach: Float
-    ) -> tuple[Array2f, Array2f]:
-        x, y, p, r, s = self.outline(geometry, reach)
-        Array2f = types_of(type(p)).Array2f
-        half_sizes = Array2f(dr.sqrt(1 + dr.square(r / s)) / p, 1 / s)
-        return Array2f(x, y), dr.sqrt(reach) * half_sizes
-
-    @override
-    def pack_tangents(self, geometry: list[Float], tangents: list[Float]) -> list[Float]:
-        return super().pack_tangents(geometry, tangents[:6]) + list(tangents[6:])
 
 
 @dataclass(frozen=True)

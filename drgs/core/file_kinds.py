@@ -26,7 +26,7 @@ SIGNATURES = {b"PK\3\4": "zip", b"\x1f\x8b": "gz", b"7z\xbc\xaf": "7z", b"\x1aE\
 def describe_file(path: Path) -> str:
     """Return what a file of another kind is, and what to do with it; "" for all other files."""
     suffix, start = path.suffix.lower().removeprefix("."), b""
-    with suppress(UserError), open_regular(path) as file:
+    with suppress(UserError, OSError), open_regular(path) as file:
         start = file.read(8)
     kinds = [kind for signature, kind in SIGNATURES.items() if start.startswith(signature)]
     suffix = "mp4" if start[4:] == b"ftyp" else [suffix, *kinds][-1]
