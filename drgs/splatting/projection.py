@@ -47,7 +47,7 @@ class Splats2D:
 
     The conic (the inverse of the projected covariance) is kept as its upper triangular factor U =
     [[p, r], [0, s]] with conic = U^T U: U maps a pixel offset d to standard normal coordinates u =
-    U d, and the splat's exponent is -|u|^2 / 2. A sum of squares is never negative, whatever the
+    U d, and the splat's exponent is -u^T u / 2. A sum of squares is never negative, whatever the
     rounding, and stays accurate for needles, where a dx^2 + 2 b dx dy + c dy^2 cancels.
     """
 
