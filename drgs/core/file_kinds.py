@@ -18,7 +18,7 @@ WAYS = {
     ("lcc",): "LCC of XGRIDS, which is not read: export PLY or SPZ with its program",
     ("splatv", "rad"): "a format of viewers, which is not read: export PLY or SPZ",
 }
-"""What files are, by suffix."""
+"""Descriptions of files, with the way to use them, by suffix."""
 
 SIGNATURES = {b"PK\3\4": "zip", b"\x1f\x8b": "gz", b"7z\xbc\xaf": "7z", b"\x1aE\xdf\xa3": "mkv"}
 

@@ -108,7 +108,7 @@ def test_rows_must_be_numbers_of_the_device():
 
 
 def test_appended_rows_may_be_numpy_arrays():
-    """Such as ``Population.host`` returns."""
+    """Rows of ``Population.host`` are such arrays."""
 
     def refine(self, population, iteration):
         names = population.optimizer.state
