@@ -77,7 +77,7 @@ OTHER_CAMERAS = {
     "reconstruction.json": "run opensfm export_colmap",
     "cameras.json": "those of 3DGS are a model's; give the folder that it was trained on",
     "cameras.csv": "in RealityScan, export the registration for COLMAP",
-    "bundle.out": "Bundler's have no reader; its photographs do",
+    "bundle.out": "export COLMAP's format from the program that wrote it",
 }
 """Files of other programs with cameras, and the way to cameras that are read."""
 
