@@ -72,10 +72,7 @@ def find_reader(
 
 
 OTHER_CAMERAS = {
-    "cameras.xml": "in Metashape, export the cameras for COLMAP",
-    "poses_bounds.npy": "LLFF has them in COLMAP's sparse/0, too",
-    "reconstruction.json": "run opensfm export_colmap",
-    "cameras.json": "those of 3DGS are a model's; give the folder that it was trained on",
+    "cameras.json": "those of 3DGS are read where the photographs are in the folder images",
     "cameras.csv": "in RealityScan, export the registration for COLMAP",
     "bundle.out": "export COLMAP's format from the program that wrote it",
 }
@@ -103,7 +100,7 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
         size = f"scaled from {width} x {height} px{which} to a width of {config.data.image_size}"
     return config, (
         "no configuration is given, so that it follows from the folder: "
-        f"{NAMES.get(layout, layout)}, {size}; "
+        f"{NAMES.get(layout, f'photographs with the cameras of {layout}')}, {size}; "
         f"{config.iterations:,} iterations (--set changes any value, --budget 10m sets the time)"
     )
 

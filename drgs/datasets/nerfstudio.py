@@ -9,6 +9,7 @@ in nerfstudio, where a fisheye's rays have unit length.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 from typing_extensions import override
 
@@ -17,7 +18,7 @@ from drgs.config.schema import DataConfig
 from drgs.datasets.files import FileKind, find_files, warn_of_unnamed_masks
 from drgs.datasets.reader import DatasetReader, Photographs
 from drgs.datasets.splits import Lists, listed_frames, unlisted_splits
-from drgs.datasets.transforms import frames_with_files, note_unread, read_transforms
+from drgs.datasets.transforms import TransformsFile, frames_with_files, note_unread, read_transforms
 
 POINT_CLOUD = FileKind(
     "point cloud", "the fit starts without", suffixes=frozenset(), is_needed=False
@@ -29,16 +30,22 @@ class NerfstudioReader(DatasetReader):
     """Reads folders of nerfstudio and instant-ngp."""
 
     order = 1
+    layout: ClassVar[str] = "nerfstudio"
+    file: ClassVar[str] = "transforms.json"
 
     @override
     def recognizes(self, folder: Path) -> bool:
-        return (folder / "transforms.json").exists()
+        return (folder / self.file).is_file()
+
+    def read(self, path: Path, notes: list[str]) -> TransformsFile:
+        """Return the content of the file of cameras; notes: gets those for the user."""
+        return read_transforms(path)
 
     @override
     def photographs(self, config: DataConfig) -> Photographs:
         notes: list[str] = []
         cloud, note = None, ""
-        meta = read_transforms(config.path / "transforms.json")
+        meta = self.read(config.path / self.file, notes)
         frames = frames_with_files(config, meta, notes)
         if meta.point_cloud is not None and config.ignore_points:
             note = "; point cloud (ply_file_path) ignored"
@@ -60,4 +67,4 @@ class NerfstudioReader(DatasetReader):
             lists = Lists(listed, " and ".join(keys.values()))
         else:
             lists = unlisted_splits((config.path,), names, notes)
-        return Photographs("nerfstudio", meta.path, frames, lists, cloud, note, notes)
+        return Photographs(self.layout, meta.path, frames, lists, cloud, note, notes)

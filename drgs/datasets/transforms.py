@@ -234,7 +234,12 @@ def read_transforms(path: Path) -> TransformsFile:
     Raises :class:`UserError` naming the file, the key, the expected and the actual value.
     """
     text = read_text(path, "file", MAX_BYTES, MEMORY_RATIO)
-    meta = validate(Transforms, parse_json(text, f"{path}: "), f"{path}: ")
+    return transforms_of(parse_json(text, f"{path}: "), path)
+
+
+def transforms_of(content: object, path: Path) -> TransformsFile:
+    """Check the content of a transforms file, or of cameras in its layout from ``path``."""
+    meta = validate(Transforms, content, f"{path}: ")
     top = {name: getattr(meta, name) for name in CameraValues.model_fields}
     top |= meta.model_extra or {}
     frames = []

@@ -16,6 +16,7 @@ from drgs.core.environment import denormals_kept
 from drgs.core.errors import UserError
 from drgs.core.origin import WORLD
 from drgs.datasets.film import is_projectable, shown_points
+from drgs.datasets.other_programs import OPENSFM_FILE, read_opensfm_points
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
@@ -227,6 +228,9 @@ def _cloud_start(config: FitConfig, dataset: Dataset, cloud: Path) -> Start:
 
 def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray | None, int]:
     """Return positions (N, 3) float64, world, colours (N, 3) float32, 0..1, and the number read."""
+    if cloud.name == OPENSFM_FILE:
+        positions, colors = read_opensfm_points(cloud)
+        return positions, colors, len(positions)
     if cloud.name not in COLMAP_POINT_FILES:
         if (known := format_to_read(cloud)) is not None and known.name != "ply":
             raise UserError(f"{cloud}: holds Gaussians, no points; set init.gaussians to it")
