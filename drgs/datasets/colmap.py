@@ -85,16 +85,22 @@ def find_model(folder: Path) -> tuple[Path, Path] | None:
     """
     for workspace in WORKSPACES:
         root = folder / workspace
-        for below in (*MODEL_FOLDERS, "."):
-            if model_files(root / below) and (
+        for below in (*(_folder_in(root, name) for name in MODEL_FOLDERS), root):
+            if model_files(below) and (
                 any((root / name).is_dir() for name in FACTORS)
                 or any(map(images_in, (root, *folders_in(root))))
             ):
-                return root, root / below
-    for below in MODEL_FOLDERS:
-        if model_files(folder / below):
-            return folder, folder / below
-    return None
+                return root, below
+    below = (_folder_in(folder, name) for name in MODEL_FOLDERS)
+    return next(((folder, model) for model in below if model_files(model)), None)
+
+
+def _folder_in(folder: Path, name: str) -> Path:
+    """Return the folder ``name`` in another, or one whose name differs in case."""
+    for part in name.split("/"):
+        similar = [path for path in folders_in(folder) if key_of(path.name) == part]
+        folder = min(similar, key=lambda path: path.name != part, default=folder / part)
+    return folder
 
 
 def folders_in(folder: Path) -> list[Path]:

@@ -189,7 +189,7 @@ def load_views(
         height, width = pixels.shape[:2]
         size = downscaled_size(width, height, config.image_size)
         camera = intrinsics(frame, pixels.shape, size)  # first: raises for a wrong size
-        read = _read_images(config, frame, pixels, store) if is_read else None
+        read = _read_images(config, frame, pixels, store, notices) if is_read else None
         image, alpha, mask, depth = read or _unread_images(frame, pixels, size)
         if (lens := lens_of(frame)) is not None and lens.distorts and config.ignore_distortion:
             lens = None
@@ -301,13 +301,19 @@ def _focal(frame: TransformsFrame, axis: str, side: int) -> float:
 
 
 def _read_images(
-    config: DataConfig, frame: TransformsFrame, pixels: np.ndarray, store: MemoryStore
+    config: DataConfig,
+    frame: TransformsFrame,
+    pixels: np.ndarray,
+    store: MemoryStore,
+    notices: Notices,
 ) -> Images:
     files, stored, depth = frame.files, (pixels.shape[1], pixels.shape[0]), None
     image, alpha = compact_photograph(pixels, config.background_rgb, config.image_size, store)
     mask = _mask(config, files["mask"], stored, store) if "mask" in files else None
     if "depth" in files:
         depth = read_depth(files["depth"], _depth_unit(frame), stored)
+        if not depth.any():
+            notices.add(files["image"], "whose depth is 0 everywhere, which means not known")
         depth = store.keep(downscale_depth(depth, config.image_size))
     return image, alpha, mask, depth
 
@@ -380,13 +386,14 @@ class Notices:
 
     def inspect(self, file: Path, pixels: np.ndarray) -> None:
         """Record findings on a photograph; pixels: (H, W, C), as they were read."""
-        findings = []
         if profile := colour_profile(file):
-            findings.append(f"with the colour profile {profile}, which is not applied")
+            self.add(file, f"with the colour profile {profile}, which is not applied")
         if pixels.shape[2] == 4 and not pixels[:, :, 3].any():
-            findings.append("that are transparent everywhere")
-        for finding in findings:
-            self._findings.setdefault(finding, []).append(self._name(file))
+            self.add(file, "that are transparent everywhere")
+
+    def add(self, file: Path, finding: str) -> None:
+        """Record a finding on a photograph."""
+        self._findings.setdefault(finding, []).append(self._name(file))
 
     def emit(self, notes: Sequence[str], train: Sequence[View], test: Sequence[View]) -> None:
         """Emit ``notes`` and the findings, each as a :class:`UserNote`."""

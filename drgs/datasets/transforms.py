@@ -18,8 +18,17 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetPydanticSchema, Strict
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetPydanticSchema,
+    Strict,
+    model_validator,
+)
 from pydantic_core.core_schema import no_info_after_validator_function
+from typing_extensions import Self
 
 from drgs.cameras.lens import LENSES, Lens
 from drgs.cameras.viewpoints import MAX_COORDINATE, CameraMotion, between_opencv_and_opengl
@@ -151,6 +160,15 @@ class CameraValues(BaseModel):
     mask_path: Text | None = None
     depth_file_path: Text | None = None
     depth_unit_scale_factor: Positive | None = None
+    distortion_params: Annotated[list[Number], Field(min_length=6, max_length=6)] | None = None
+
+    @model_validator(mode="after")
+    def _name_coefficients(self) -> Self:
+        """Give nerfstudio's list of coefficients their names."""
+        if self.distortion_params is None:
+            return self
+        named = zip(("k1", "k2", "k3", "k4", "p1", "p2"), self.distortion_params, strict=True)
+        return self.model_copy(update={**dict(named), "distortion_params": None})
 
 
 class FrameValues(CameraValues):

@@ -45,7 +45,7 @@ def save(path, mask):
     Image.fromarray(mask).save(path)
 
 
-@pytest.mark.parametrize("below", ["sparse/0", "sparse", "colmap/sparse/0"])
+@pytest.mark.parametrize("below", ["sparse/0", "sparse", "colmap/sparse/0", "Sparse/0"])
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 def test_views_have_poses_and_intrinsics_of_the_model(tmp_path, below, write):
     model = write_dataset(tmp_path, below=below, write=write)

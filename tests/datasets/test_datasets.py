@@ -197,6 +197,18 @@ def test_lens_is_read_and_does_not_depend_on_the_image_size(photographs, values,
     assert load(photographs, ignore_distortion=True).train[0].lens is None
 
 
+@pytest.mark.parametrize("place", ["", "frames 1 "])
+def test_coefficients_may_be_a_list_of_nerfstudio(photographs, place):
+    path = photographs / "transforms.json"
+    put(path, "k1", 7.0)
+    put(path, f"{place}distortion_params", [0.1, 0.02, 0.0, 0.0, -0.03, 0.04])
+    lenses = [view.lens for view in (*load(photographs).train, *load(photographs).test)]
+    expected = RadialTangential.from_coefficients(k1=0.1, k2=0.02, p1=-0.03, p2=0.04)
+    assert lenses.count(expected) == (1 if place else len(lenses))
+    put(path, f"{place}distortion_params", [0.1])
+    assert "distortion_params must have at least 6" in refusal(photographs)
+
+
 def test_panoramas_need_no_focal_length(photographs):
     """The whole image is a turn, whatever nerfstudio writes; and no pinhole could replace it."""
     path = photographs / "transforms.json"

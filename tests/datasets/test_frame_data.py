@@ -111,6 +111,14 @@ def test_missing_masks_drop_their_photographs_and_missing_depths_do_not(photogra
     ]
 
 
+def test_depth_that_is_zero_everywhere_is_reported(photographs):
+    np.save(photographs / "depth.npy", np.zeros((6, 8)))
+    give(photographs, "03.png", depth_file_path="depth.npy")
+    _, notes = load_noting(photographs)
+    (note,) = (note for note in notes if "depth" in note)
+    assert "whose depth is 0 everywhere, which means not known: 1 (images/03.png)" in note
+
+
 def test_a_folder_of_unnamed_masks_is_reported(photographs):
     (photographs / "masks").mkdir()
     iio.imwrite(photographs / "masks" / "01.png", GREY_MASK)
