@@ -100,9 +100,10 @@ class Gaussians(Generic[Tensor]):
 
         A ``UserNote`` names what the format has no room for.
         """
-        from drgs.io.formats import FORMATS, ORIGIN, Z_TO_Y
+        from drgs.io.formats import FORMATS, ORIGIN, Z_TO_Y, check_shapes
 
         chosen, host = FORMATS.get(name).value, self.numpy()
+        check_shapes(name, {n: getattr(host, n) for n in host._names})
         values = dict(self.rendered_with or {})
         lost = ["harmonics"] if self.sh_degree > 0 and not chosen.has_harmonics else []
         lost += [f"{key} {value}" for key, value in values.items() if not chosen.holds(key)]

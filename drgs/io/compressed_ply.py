@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from typing_extensions import override
@@ -69,6 +70,9 @@ class CompressedPly(FileFormat):
     suffix = ".compressed.ply"
     description = "PlayCanvas's compressed PLY, for SuperSplat and PlayCanvas"
     metadata = None
+    ranges = MappingProxyType(
+        {"shN": (-SH_RANGE, SH_RANGE), "log_scales": (-MAX_LOG_SCALE, MAX_LOG_SCALE)}
+    )
 
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:

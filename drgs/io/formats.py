@@ -13,10 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
-from drgs.core.errors import UserError, one_line
+from drgs.core.errors import UserError, note_user, one_line
 from drgs.core.file_kinds import describe_file
 from drgs.core.files import open_regular
 from drgs.core.origin import WORLD, Origin
@@ -72,6 +73,10 @@ class FileFormat:
 
     metadata: frozenset[str] | None = frozenset()
     """Names of ``rendered_with`` that files can record; None: all. Notes report the others."""
+
+    ranges: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    """Smallest and largest value of arrays, by name; :meth:`encode` cuts off what is beyond, and a
+    note says how many Gaussians this changes."""
 
     def recognizes(self, path: Path) -> bool:
         """Return whether the content is of this format, for formats that share a suffix."""
@@ -174,6 +179,7 @@ def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) ->
     extension = FORMATS.get(name)
     check(name, gaussians)
     kept = {k: v for k, v in rendered_with.items() if extension.value.holds(k)}
+    _note_cut_off(name, gaussians, extension.value.ranges)
     with extension.reporting():
         content = extension.value().encode(gaussians, kept)
         if not isinstance(content, (bytes, bytearray, memoryview)):
@@ -184,6 +190,7 @@ def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) ->
 def check(name: str, gaussians: Arrays) -> None:
     """Raise :class:`UserError` for Gaussians that the format ``name`` cannot hold."""
     extension = FORMATS.get(name)
+    check_shapes(name, gaussians)
     if "smoothing" in gaussians and not extension.value.has_smoothing:
         raise UserError(
             f"the format {name} has no room for the smoothing of Gaussians: bake it into them "
@@ -196,15 +203,42 @@ def check(name: str, gaussians: Arrays) -> None:
             check_range(f"the format {name}", field, values)
 
 
-def _check_arrays(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
-    """Return a format's arrays as float32; raise ValueError if they are not :data:`Arrays`."""
+def check_shapes(name: str, gaussians: Arrays) -> None:
+    """Raise :class:`UserError` for Gaussians to write that are not :data:`Arrays`."""
+    try:
+        _check_shapes(gaussians, 0)
+    except ValueError as error:
+        raise UserError(f"the format {name}: {error}") from None
+
+
+def _note_cut_off(name: str, gaussians: Arrays, ranges: Mapping[str, tuple[float, float]]) -> None:
+    found = []
+    for field, (low, high) in ranges.items():
+        values = gaussians[field].reshape(len(gaussians[field]), -1)
+        beyond = ((values < low) | (values > high)).any(axis=1)
+        if number := np.count_nonzero(beyond):
+            found.append(f"{field} of {number:,} (it holds {low:.4g} to {high:.4g})")
+    if found:
+        num = len(gaussians["means"])
+        note_user(f"the format {name} cuts off, of {num:,} Gaussians: {'; '.join(found)}")
+
+
+def _check_shapes(arrays: Arrays, least: int = 1) -> None:
+    """Raise ValueError if arrays do not have the names and shapes of :data:`Arrays`."""
     if set(arrays) - {"smoothing"} != set(SHAPES) - {"smoothing"}:
         raise ValueError(f"arrays must be {', '.join(SHAPES)}, got {', '.join(arrays)}")
     num = len(arrays["means"])
     for name, values in arrays.items():
-        if not num or np.shape(values) not in [(num, *shape) for shape in SHAPES[name]]:
+        if num < least or np.shape(values) not in [(num, *shape) for shape in SHAPES[name]]:
             listed = " or ".join(map(str, SHAPES[name]))
             raise ValueError(f"{name}: {listed} per Gaussian expected, got {np.shape(values)}")
+        if np.asarray(values).dtype.kind not in "fiu":
+            raise ValueError(f"{name} must be real numbers, got {np.asarray(values).dtype}")
+
+
+def _check_arrays(path: str | Path, arrays: Arrays) -> dict[str, np.ndarray]:
+    """Return a format's arrays as float32; raise ValueError if they are not :data:`Arrays`."""
+    _check_shapes(arrays)
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused below
         arrays = {name: np.asarray(values, np.float32) for name, values in arrays.items()}
     for name, values in arrays.items():

@@ -19,6 +19,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -42,6 +43,8 @@ from drgs.io.formats import (
 )
 from drgs.io.ply import STATEMENT
 from drgs.io.quantization import (
+    MAX_LOG_SCALE,
+    MIN_LOG_SCALE,
     arrays_from_activated,
     colors_from_sh0,
     normalize_quaternions,
@@ -83,6 +86,7 @@ class Glb(FileFormat):
     description = "binary glTF with KHR_gaussian_splatting, in full precision"
     up = "y"
     metadata = None
+    ranges = MappingProxyType({"log_scales": (MIN_LOG_SCALE, MAX_LOG_SCALE)})
 
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:
@@ -137,8 +141,7 @@ def _attributes(g: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return arrays of float32 or bytes by name, each a multiple of 4 bytes long."""
     opacities = opacities_from_logits(g["logit_opacities"])
     rgba = np.column_stack([colors_from_sh0(g["sh0"]), opacities])
-    limits = np.finfo(np.float32)
-    scales = np.exp(np.clip(g["log_scales"].astype(np.float64), -200, np.log(float(limits.max))))
+    scales = np.exp(np.clip(g["log_scales"].astype(np.float64), MIN_LOG_SCALE, MAX_LOG_SCALE))
     attributes = {
         "POSITION": g["means"],
         "COLOR_0": round_to_uint32(rgba * 255, 255).astype("u1"),

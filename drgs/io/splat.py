@@ -10,14 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from typing_extensions import override
 
+from drgs.core.constants import SH_C0
 from drgs.core.errors import Place, UserError
 from drgs.core.files import read_bytes
 from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar, check_range
 from drgs.io.quantization import (
+    MIN_LOG_SCALE,
     arrays_from_activated,
     colors_from_sh0,
     normalize_quaternions,
@@ -42,6 +45,9 @@ class Splat(FileFormat):
     suffix = ".splat"
     description = "antimatter15's .splat, for old viewers: no harmonics"
     has_harmonics = False
+    ranges = MappingProxyType(
+        {"sh0": (-0.5 / SH_C0, 0.5 / SH_C0), "log_scales": (MIN_LOG_SCALE, np.log(MAX_NUMBER))}
+    )
 
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:

@@ -28,6 +28,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from typing_extensions import override
@@ -87,6 +88,7 @@ class Spz(FileFormat):
     description = "Niantic's SPZ, the smallest"
     up = "y"
     metadata = frozenset({"antialiased"})
+    ranges = MappingProxyType({"sh0": (-0.5 / COLOR_SCALE, 0.5 / COLOR_SCALE), "shN": (-1.0, 1.0)})
 
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:

@@ -16,6 +16,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from drgs.core.memory import require_memory
 from drgs.core.origin import WORLD
 from drgs.io.formats import FORMATS, ORIGIN, UP, Arrays, FileFormat, Scalar, check_range, pop_origin
 from drgs.io.quantization import (
+    MIN_LOG_SCALE,
     arrays_from_activated,
     normalize_quaternions,
     opacities_from_logits,
@@ -56,6 +58,7 @@ class Usd(FileFormat):
     description = "OpenUSD's ParticleField3DGaussianSplat (extra usd)"
     up = "z"
     metadata = frozenset(ORIGIN)
+    ranges = MappingProxyType({"log_scales": (MIN_LOG_SCALE, 80.0)})
 
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:

@@ -2,6 +2,7 @@
 
 import re
 import tracemalloc
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -83,6 +84,39 @@ def test_what_a_format_cannot_hold_is_not_written(tmp_path, each):
     with pytest.raises(UserError, match=r"log_scales of Gaussian 3 must be finite, got nan"):
         gaussians.save(path)
     assert not list(tmp_path.iterdir())
+
+
+@each_format
+@pytest.mark.parametrize("field", ["means", "quats", "log_scales", "logit_opacities", "sh0", "shN"])
+def test_arrays_of_other_shapes_are_not_written(tmp_path, each, field):
+    gaussians = gaussians_within_ranges(5)
+    values = getattr(gaussians, field)
+    for wrong in (values[:-1], values[..., None], values.astype(str)):
+        object.__setattr__(gaussians, field, wrong)
+        named = field if len(wrong) == 5 or field != "means" else "quats"  # one more than means
+        with pytest.raises(UserError, match=rf"the format {each.name}: {named}"):
+            gaussians.save(tmp_path / f"a{each.value.suffix}")
+    assert not list(tmp_path.iterdir())
+
+
+@each_format
+@pytest.mark.parametrize(
+    ("field", "value"), [("sh0", 90), ("shN", 30), ("log_scales", 60), ("log_scales", -200)]
+)
+def test_a_note_says_what_a_format_cuts_off(tmp_path, each, field, value):
+    """There is a note exactly where what is read differs from what was written."""
+    path, gaussians = tmp_path / f"a{each.value.suffix}", gaussians_within_ranges(40, degree=1)
+    rows = [7, 9]
+    getattr(gaussians, field)[rows] = value
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        gaussians.save(path)
+    found = getattr(matched(gaussians, Gaussians.load(path)), field)
+    changed = found.size and np.abs(np.abs(found[rows]) - abs(value)).max() > 0.02 * abs(value)
+    notes = [str(warning.message) for warning in caught if "cut" in str(warning.message)]
+    assert len(notes) == bool(changed)
+    if changed:
+        assert each.name in notes[0] and re.search(r"\b2 (of 40 Gaussians|\(it holds )", notes[0])
 
 
 def test_the_longest_suffix_decides_the_format():
