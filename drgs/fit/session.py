@@ -293,7 +293,7 @@ class FitSession:
                     observer.after_iteration(trainer, self.history, done, lambda: stop.requested)
                 stops = bool(comm.broadcast_numbers(stop.requested))
                 every = trainer.config.output.checkpoint_every
-                is_due = every is not None and (done.is_last or done.report.passes(every))
+                is_due = done.is_last or (every is not None and done.report.passes(every))
                 if stops or is_due:
                     self._save_checkpoint()
                 if stops:

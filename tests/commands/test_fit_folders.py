@@ -383,3 +383,28 @@ def test_what_a_fit_does_not_go_on_with_is_refused(stopped, ended):
     (ended / "out" / "metrics.json").write_text("[]")
     message = "metrics.json: must be what a fit wrote, got something else; remove it, and resume"
     assert_fit_refused("--resume", ended / "out", folder=ended, message=message)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("behind", [False, True])
+def test_a_fit_that_goes_on_may_be_killed_at_any_file(config, tmp_path, behind):
+    """What is in the folder belongs together: the metrics are those of the Gaussians, or gone."""
+    first = tmp_path / "first"
+    assert_fits(config, "--out", first)
+    before = (first / "point_cloud.ply").read_bytes()
+    for moment in range(100):
+        out = tmp_path / str(moment)
+        shutil.copytree(first, out)
+        more = ("--resume", out, "--set", f"iterations={2 * ITERATIONS}")
+        was_killed, _ = run_crashing_fit(moment, behind, *more)
+        if (out / "metrics.json").is_file():
+            done = json.loads((out / "metrics.json").read_text())["iterations"]
+            is_earlier = (out / "point_cloud.ply").read_bytes() == before
+            assert done == (1 if is_earlier else 2) * ITERATIONS, moment
+        if not was_killed:
+            break
+        has_ended = (out / "metrics.json").is_file()  # or the fit goes on as it was told before
+        assert_fits(*(more if has_ended else more[:2]))
+        assert_done(out)
+        assert load_config(out / "config.yml").last_iteration == 2 * ITERATIONS
+    assert moment > 10
