@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import drjit as dr
@@ -13,6 +14,7 @@ from typing_extensions import override
 
 from drgs.core.adam import make_optimizer, optimizer_state, restore_optimizer
 from drgs.core.errors import UserError
+from drgs.core.files import write_json
 from drgs.core.types import Float
 from drgs.effects.base import TrainingEffect, as_numbers
 
@@ -73,6 +75,17 @@ class OptimisedEffect(TrainingEffect):
         """Return the numbers, (V, K) each."""
         rows = self._optimizer_rows()
         return {name: rows[f"{name}.value"] for name in self.optimizers}
+
+    @override
+    def write(self, folder: Path, dataset: Dataset) -> None:
+        """Write ``NAME.json``: the numbers of each training view by its name, or those of all."""
+        numbers = {name: rows.tolist() for name, rows in self.numpy().items()}
+        views = [view.name for view in dataset.train]
+        by_view = {
+            name: dict(zip(views, rows, strict=True)) if len(rows) > 1 else rows[0]
+            for name, rows in numbers.items()
+        }
+        write_json(folder / f"{self.name}.json", by_view)
 
     @override
     def leaves(self, view: TrainingView) -> Mapping[str, dr.ArrayBase]:

@@ -388,7 +388,7 @@ def test_what_a_fit_does_not_go_on_with_is_refused(stopped, ended):
 @pytest.mark.slow
 @pytest.mark.parametrize("behind", [False, True])
 def test_a_fit_that_goes_on_may_be_killed_at_any_file(config, tmp_path, behind):
-    """What is in the folder belongs together: the metrics are those of the Gaussians, or gone."""
+    """Metrics in the folder are those of the Gaussians there, or gone."""
     first = tmp_path / "first"
     assert_fits(config, "--out", first)
     before = (first / "point_cloud.ply").read_bytes()

@@ -1,5 +1,6 @@
 """Extensions of a fit that live outside of drgs: by name in a configuration, and as objects."""
 
+import json
 import os
 import subprocess
 import sys
@@ -17,9 +18,11 @@ from drgs.config.changes import with_changes
 from drgs.config.load import config_from, dump_config, load_config
 from drgs.core.errors import UserError
 from drgs.effects.base import training_effects
+from drgs.effects.optimised import OptimisedEffect
 from drgs.fit.__main__ import add_arguments
 from drgs.fit.summary import summary_of_fit
 from drgs.integrator.summary import format_effects
+from drgs.results.folder import result_names
 from drgs.training.losses import prepare_target
 
 
@@ -90,6 +93,22 @@ def test_fit_uses_configured_extensions_and_resumes_to_the_same_bytes():
     assert trainer.num_gaussians == start - start // 2
     assert [bool(report.density) for report in reports] == [False] * 5 + [True] + [False] * 2
     assert float(effect.state()["strength.value"][0, 0]) != 0
+
+
+def test_numbers_of_an_effect_are_written_beside_the_results(tmp_path, monkeypatch):
+    """Numbers of all views are there once, those of each view by its name."""
+    trainer = make_trainer()
+    (effect,), views = trainer.effects, trainer.dataset.train
+    effect.write(tmp_path, trainer.dataset)
+    strength = json.loads((tmp_path / "vignetting.json").read_text())
+    assert strength == {"strength": [float(effect.state()["strength.value"][0, 0])]}
+    rows = np.arange(2.0 * len(views)).reshape(-1, 2)
+    each = OptimisedEffect({"gain": rows}, {"gain": 0.1})
+    monkeypatch.setattr(OptimisedEffect, "name", "gains")
+    each.write(tmp_path, trainer.dataset)
+    written = json.loads((tmp_path / "gains.json").read_text())
+    assert written == {"gain": {v.name: list(row) for v, row in zip(views, rows, strict=True)}}
+    assert "vignetting.json" in result_names()
 
 
 def test_loss_and_its_term_match_numpy(examples):
