@@ -102,6 +102,9 @@ class Case:
                 check_type("Case()", name, value, *([int] if name in WHOLE else [int, float]))
                 if not least <= cast(float, value) <= most:
                     raise UserError(f"Case(): {name} must be {least} to {most:g}, got {value}")
+        pair = self.aperture
+        if pair is not None and not (isinstance(pair, tuple) and len(pair) == 2 and min(pair) > 0):
+            raise UserError(f"Case(): aperture must be (radius, focus distance) > 0, got {pair!r}")
         known = {each.name for each in fields(Approximations)}
         for name in self.approximations.keys() - known:
             raise UserError(f"Case(): approximations has no {name}{did_you_mean(name, known)}")

@@ -60,7 +60,7 @@ class ColmapReader(DatasetReader):
         for image, file, mask in zip(images, files, masks, strict=True):
             values = _values(model.cameras[image.camera], image, file, mask, folder)
             paths = {"image": file}
-            if mask is not None and not config.ignore_masks:
+            if mask is not None:
                 paths["mask"] = mask
             place = f"image {one_line(image.name, 100)}: "
             frames.append(TransformsFrame(values, folder, place, is_as_stored=True, files=paths))

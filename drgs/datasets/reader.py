@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import ClassVar, TypeVar
@@ -111,7 +111,11 @@ class DatasetReader:
         keeps: accepts, by name, the views whose images are read.
         """
         photographs = self.photographs(config)
-        frames = sorted(photographs.frames, key=lambda frame: frame.file_path)
+        ignored = {"mask" * config.ignore_masks, "depth" * config.ignore_depth}
+        frames = [
+            replace(frame, files={k: v for k, v in frame.files.items() if k not in ignored})
+            for frame in sorted(photographs.frames, key=lambda frame: frame.file_path)
+        ]
         names = [frame.file_path for frame in frames]
         split = split_of(config, photographs.source, photographs.lists, names, photographs.notes)
         left = left_out(config, frames)

@@ -15,6 +15,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 import numpy as np
@@ -208,21 +209,28 @@ class TransformsFrame:
         camera_to_world: np.ndarray,
         focal: tuple[float, float],
         principal: tuple[float, float] | None = None,
+        lens: Mapping[str, object] = MappingProxyType({}),
+        files: Mapping[str, Path] = MappingProxyType({}),
     ) -> TransformsFrame:
-        """Return the frame of a photograph by a pinhole camera.
+        """Return the frame of a photograph.
 
         source: the file or folder with the pose, and index: the frame's, for messages;
-        camera_to_world: (4, 4), OpenCV axes; focal, principal: px (None: the image's middle).
+        camera_to_world: (4, 4), OpenCV axes; focal, principal: px (None: the image's middle);
+        lens: keys as in ``transforms.json``, such as ``camera_model`` and ``k1`` (none: a pinhole);
+        files: ``mask`` and ``depth`` of the photograph, where there are any.
 
         Raises :class:`UserError` for a pose that is not rigid and finite.
         """
         opengl = np.asarray(camera_to_world, np.float64) * [1, -1, -1, 1]
-        values = {"fl_x": focal[0], "fl_y": focal[1], "file_path": image.name}
+        values = {"fl_x": focal[0], "fl_y": focal[1], "file_path": image.name, **lens}
+        values |= {FILE_KEYS[what]: str(file) for what, file in files.items()}
         if principal is not None:
             values |= {"cx": principal[0], "cy": principal[1]}
         values |= {"transform_matrix": opengl.tolist()}
         checked = validate(FrameValues, values, f"{source}: frame {index}: ")
-        return TransformsFrame(checked, source, f"frames[{index}].", files={"image": image})
+        return TransformsFrame(
+            checked, source, f"frames[{index}].", files={"image": image, **files}
+        )
 
     @property
     def file_path(self) -> str:

@@ -80,7 +80,8 @@ def test_arguments_of_other_types(place, value):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"width": 0}, {"count": -1}, {"degree": 4}, {"focal": float("nan")}, {"step": 0.0}],
+    [{"width": 0}, {"count": -1}, {"degree": 4}, {"focal": float("nan")}, {"step": 0.0}]
+    + [{"aperture": value} for value in (3, (0.1,), (0.1, 0.0))],
     ids=str,
 )
 def test_numbers_of_cases(wrong):

@@ -5,16 +5,19 @@ import json
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 from support import small_capture as capture
 from support import small_fits as fits
 from support.datasets import views_by_name
 from support.installed_examples import installed_examples
 
 import drgs
+from drgs.cameras.fisheye import Fisheye
 from drgs.config.load import config_from
 from drgs.core.errors import UserError
 from drgs.datasets import load_dataset
 from drgs.datasets.folders import find_reader
+from drgs.datasets.reader import READERS, DatasetReader, Photographs, TransformsFrame
 from drgs.io.images import write_png
 
 
@@ -80,3 +83,40 @@ def test_shipped_readers_come_first_and_unknown_ones_are_refused(folder, tmp_pat
         load_dataset(path, type="numpy_pose")
     (path / "transforms.json").write_text("{}")
     assert find_reader(config_from({"data": {"path": str(path)}}, "x").data)[0] == "nerfstudio"
+
+
+class LensAndMask(DatasetReader):
+    """The example's cameras behind a fisheye, with a mask and depth of the first photograph."""
+
+    def photographs(self, config):
+        frames, (mask, depth) = [], (config.path / name for name in ("mask.png", "depth.npy"))
+        for index, pose in enumerate(np.load(config.path / "poses.npy")):
+            image = config.path / "images" / f"{index}.png"
+            lens = {"camera_model": "OPENCV_FISHEYE", "k1": 0.1}
+            files = {} if index else {"mask": mask, "depth": depth}
+            frames.append(
+                TransformsFrame.from_camera(
+                    config.path, index, image, pose, (30.0, 31.0), None, lens, files
+                )
+            )
+        return Photographs("outside", config.path, frames)
+
+
+def test_a_reader_gives_lenses_masks_and_depth(folder):
+    path, views = folder
+    shape = np.asarray(views[0].image).shape[:2]
+    mask = np.arange(np.prod(shape)).reshape(shape) % 3 > 0
+    Image.fromarray(np.uint8(255 * mask)).save(path / "mask.png")
+    np.save(path / "depth.npy", 2.0 + mask)
+    READERS.register("outside")(LensAndMask)
+    dataset = load_dataset(path, type="outside", test_every=4)
+    found = views_by_name(dataset)
+    assert all(v.lens == Fisheye.from_coefficients(k1=0.1) for v in found.values())
+    np.testing.assert_array_equal(found["0"].mask, mask)
+    np.testing.assert_array_equal(found["0"].depth, 2.0 + mask)
+    assert found["1"].mask is None and found["1"].depth is None
+    assert "; masks of 1 of 5 photographs; depth in units of 1" in dataset.description
+    settings = {"ignore_masks": True, "ignore_depth": True}
+    plain = load_dataset(path, type="outside", test_every=4, **settings)
+    assert views_by_name(plain)["0"].mask is None and views_by_name(plain)["0"].depth is None
+    assert "masks (mask_path) ignored; depth (depth_file_path) ignored" in plain.description

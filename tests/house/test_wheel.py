@@ -217,6 +217,16 @@ def photographs(tmp_path):
     return tmp_path
 
 
+def test_template_of_a_package_is_installed_and_passes_its_own_tests(scripts, tmp_path):
+    source = shutil.copytree(REPOSITORY / "examples" / "extension", tmp_path / "source")
+    install_for(build_wheel(source, tmp_path), scripts / "python")
+    tests = shutil.move(source / "tests", tmp_path / "tests")
+    shutil.rmtree(source)
+    line = (scripts / "python", "-m", "pytest", "-q", "-p", "no:cacheprovider", tests)
+    assert " passed" in run(*line, cwd=tmp_path)
+    assert "lens equisolid" in run(scripts / "drgs", "fit", "--help", cwd=tmp_path)
+
+
 def test_external_package_can_use_every_extension_point(scripts, photographs):
     """A strategy, effect, loss, term, lens, falloff, file format and reader; no file of drgs."""
     folder = photographs
