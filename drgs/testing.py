@@ -103,7 +103,7 @@ class Case:
                 if not least <= cast(float, value) <= most:
                     raise UserError(f"Case(): {name} must be {least} to {most:g}, got {value}")
         pair = self.aperture
-        if pair is not None and not (isinstance(pair, tuple) and len(pair) == 2 and min(pair) > 0):
+        if pair is not None and (np.shape(pair) != (2,) or not pair[0] >= 0 < pair[1]):
             raise UserError(f"Case(): aperture must be (radius, focus distance) > 0, got {pair!r}")
         known = {each.name for each in fields(Approximations)}
         for name in self.approximations.keys() - known:
