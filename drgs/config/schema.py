@@ -151,20 +151,21 @@ class InitConfig(Section):
 
     removed: ClassVar = {"scale": 1.0}
 
-    start: Literal["auto", "masks", "points", "random"] = Field(
+    start: Literal["auto", "masks", "points", "sweep", "random"] = Field(
         "auto",
         description="Start of the Gaussians. masks: the surface of the visual hull of the images' "
-        "alpha channels, coloured from the images. points: a point cloud. random: in the start "
-        "box, or where the cameras look. auto: point_cloud or half_extent if given; else masks if "
-        "nearly all training images are partly transparent; else the dataset's point cloud if it "
-        "has one; else random.",
+        "alpha channels, coloured from the images. points: a point cloud. sweep: points on which "
+        "neighbouring photographs agree. random: in the start box, or where the cameras look. "
+        "auto: point_cloud or half_extent if given; else masks if nearly all training images are "
+        "partly transparent; else the dataset's point cloud if it has one; else sweep where "
+        "photographs agree; else random.",
     )
     num_points: Count | None = Field(
         None,
         ge=4,
         le=100_000_000,
-        description="Number of random points, or maximum number on the hull. null: 100,000 with "
-        "the strategy adc, else two fifths of the final number.",
+        description="Number of random points, or most points of a sweep or on the hull. null: "
+        "100,000 with the strategy adc, else two fifths of the final number.",
     )
     half_extent: float | None = Field(
         None,
@@ -476,7 +477,7 @@ class FitConfig(ExtensibleSection):
             for name, value in others.items():
                 expected = f"init.{name} must be {value or 'null'} with init.gaussians"
                 _require(getattr(init, name) == value, expected, getattr(init, name))
-        if init.start in ("masks", "random"):
+        if init.start in ("masks", "sweep", "random"):
             expected = f"init.point_cloud must be null where init.start is {init.start}"
             _require(init.point_cloud is None, expected, init.point_cloud)
         if init.start == "points":

@@ -43,6 +43,8 @@ their middle. The 3DGS reference has 3.2e-4 world units, for scenes of about uni
 
 NUM_NEIGHBOURS = 3
 
+MIN_SWEPT = 1000  # points of a plane sweep, or a fit starts at random ones
+
 MAX_COLOR_VIEWS, MIN_COLOR_VIEWS = 60, 8
 """Number of views whose images colour points: a third of them see most points."""
 
@@ -138,10 +140,12 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
             )
     cloud = _cloud_file(init, dataset)
     if cloud is None or cloud.name not in COLMAP_POINT_FILES:
-        _check_unfiltered(init, "random points" if cloud is None else str(cloud))
-    start = (
-        _random_start(config, dataset) if cloud is None else _cloud_start(config, dataset, cloud)
-    )
+        _check_unfiltered(init, "other points" if cloud is None else str(cloud))
+    if cloud is not None:
+        start = _cloud_start(config, dataset, cloud)
+    else:
+        swept = _swept_start(config, dataset) if init.start in ("auto", "sweep") else None
+        start = swept or _random_start(config, dataset)
     return replace(start, description=start.description + note)
 
 
@@ -258,6 +262,26 @@ def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray |
 def _num_points(init: InitConfig) -> int:
     assert init.num_points is not None, "resolve_defaults sets it"
     return init.num_points
+
+
+def _swept_start(config: FitConfig, dataset: Dataset) -> Start | None:
+    """Return points of a plane sweep; None: there are few, or the layout has a box of its own."""
+    if start_box_of(config.init, dataset) is not None and config.init.start == "auto":
+        return None
+    from drgs.initialization.plane_sweep import swept_points
+
+    means, colors = swept_points(dataset.train)
+    if len(means) >= MIN_SWEPT:
+        chosen = np.random.default_rng(config.seed).permutation(len(means))
+        chosen = np.sort(chosen[: _num_points(config.init)])
+        what = f"{len(chosen):,} of {len(means):,} points of a plane sweep between photographs"
+        return Start(means[chosen].astype(np.float32), colors[chosen], what)
+    if config.init.start == "sweep":
+        raise UserError(
+            f"init.start: a plane sweep needs photographs that overlap, and found {len(means):,} "
+            "points; give init.point_cloud, or set init.start=random"
+        )
+    return None
 
 
 def _random_start(config: FitConfig, dataset: Dataset) -> Start:
