@@ -17,8 +17,10 @@ Nothing here is differentiated.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
+from typing import Any
 
 import drjit as dr
 
@@ -105,7 +107,7 @@ class RaySplats:
         size = dr.width(walk.origin)
         _, _, T, color = dr.while_loop(
             state=(
-                _Place.first_of(dr.zeros(t.Float, size)),
+                walk.begin(),
                 [dr.full(t.Float, -dr.inf, size), dr.zeros(t.UInt32, size)],
                 dr.select(segment.active, t.Float(1), -1),
                 [dr.zeros(t.Float, size) for _ in range(3)],
@@ -150,28 +152,15 @@ class RaySplats:
                 false_fn=lambda coverage, draws, *_: (coverage, draws),
             )
 
-        def body(at: _Place, coverage: Float, draws: list) -> tuple:
-            return dr.while_loop(
-                state=(walk.find(at), coverage, draws),
-                cond=lambda at, coverage, draws: at.has_entry(),
-                body=choose,
-            )
-
         def should_continue(at: _Place, coverage: Float, draws: list) -> Bool:
             # Later cells are behind the splats drawn in this one.
             more = (at.entry < at.last) | ((_farthest(draws) == dr.inf) & (at.end < walk.stop))
             return segment.active & more
 
         size = dr.width(walk.origin)
-        _, coverage, draws = dr.while_loop(
-            state=(
-                _Place.first_of(dr.zeros(t.Float, size)),
-                dr.zeros(t.Float, size),
-                [_Draw.without_splat(t, size) for _ in range(count)],
-            ),
-            cond=should_continue,
-            body=body,
-        )
+        draws = [_Draw.without_splat(t, size) for _ in range(count)]
+        state = walk.begin(), dr.zeros(t.Float, size), draws
+        _, coverage, draws = walk.read_lists(state, should_continue, choose)
         basis = sh_basis(walk.direction, self.sh_degree)
         found = [self._color(one.row, basis, one.peak < dr.inf) for one in draws]
         # Russian roulette: with the probability A^n, all draws are stopped, and the walk has ended.
@@ -202,21 +191,11 @@ class RaySplats:
             at, _, _, log2_alpha = walk.read_entry(at)
             return at, dr.fma(-walk.alpha(log2_alpha), T, T)
 
-        def body(at: _Place, T: Float) -> tuple:
-            return dr.while_loop(
-                state=(walk.find(at), T),
-                cond=lambda at, T: (least <= T) & at.has_entry(),
-                body=weaken,
-            )
-
-        size = dr.width(walk.origin)
-        _, T = dr.while_loop(
-            state=(
-                _Place.first_of(dr.zeros(t.Float, size)),
-                dr.select(segment.active, t.Float(1), 0),
-            ),
-            cond=lambda at, T: (least <= T) & walk.should_continue(at),
-            body=body,
+        _, T = walk.read_lists(
+            (walk.begin(), dr.select(segment.active, t.Float(1), 0)),
+            lambda at, T: (least <= T) & walk.should_continue(at),
+            weaken,
+            lambda at, T: (least <= T) & at.has_entry(),
         )
         return T
 
@@ -231,12 +210,6 @@ class _Place:
     first: UInt32  # first entry of the list
     last: UInt32  # one past the list's end
     turn: UInt32  # entries since rays of a vector waited for each other
-
-    @staticmethod
-    def first_of(start: Float) -> _Place:
-        """Return the place before the first cell."""
-        UInt32, size = types_of(type(start)).UInt32, dr.width(start)
-        return _Place(start, type(start)(start), *(dr.zeros(UInt32, size) for _ in range(4)))
 
     def has_entry(self) -> Bool:
         """Return whether the list has entries, and other rays need not find another cell first."""
@@ -259,6 +232,30 @@ class _Walk:
         end = dr.select(end < segment.far, end, segment.far)
         origin = segment.origin + segment.direction * dr.select(start < end, start, 0)
         return _Walk(splats, origin, segment.direction, end - start)
+
+    def begin(self) -> _Place:
+        """Return the place before the first cell."""
+        t, size = types_of(type(self.stop)), dr.width(self.origin)
+        start = dr.zeros(t.Float, size)
+        return _Place(start, t.Float(start), *(dr.zeros(t.UInt32, size) for _ in range(4)))
+
+    def read_lists(
+        self,
+        state: tuple,
+        cond: Callable[..., Bool],
+        visit: Callable[..., tuple],
+        reads_on: Callable[..., Bool] = lambda at, *state: at.has_entry(),
+    ) -> tuple:
+        """Visit the entries of lists, cell after cell; return the last state.
+
+        state: a place, and more; cond: whether to go on; visit: maps a state to that after the next
+        entry; reads_on: whether to go on in the list that was found.
+        """
+
+        def body(at: _Place, *others: Any) -> tuple:
+            return dr.while_loop(state=(self.find(at), *others), cond=reads_on, body=visit)
+
+        return dr.while_loop(state=state, cond=cond, body=body)
 
     def should_continue(self, at: _Place) -> Bool:
         """Return whether there is another entry or cell."""
@@ -327,13 +324,6 @@ class _Walk:
                 item = [dr.select(before, old, new) for old, new in pairs]
             return at, kept, overflows | (item[0] < dr.inf)
 
-        def body(at: _Place, window: list, overflows: Bool) -> tuple:
-            return dr.while_loop(
-                state=(self.find(at), window, overflows),
-                cond=lambda at, window, overflows: at.has_entry(),
-                body=insert,
-            )
-
         def goes_on(at: _Place, window: list, overflows: Bool) -> Bool:
             through = T
             for peak, _, log2_alpha in window:
@@ -344,15 +334,8 @@ class _Walk:
 
         size, stop = dr.width(at.first), self.splats.cutoffs.transmittance_stop
         empty = [dr.full(t.Float, dr.inf, size), dr.zeros(t.UInt32, size), dr.zeros(t.Float, size)]
-        return dr.while_loop(
-            state=(
-                at,
-                [[type(x)(x) for x in empty] for _ in range(WINDOW_PEAKS)],
-                dr.full(t.Bool, False, size),
-            ),
-            cond=goes_on,
-            body=body,
-        )
+        window = [[type(x)(x) for x in empty] for _ in range(WINDOW_PEAKS)]
+        return self.read_lists((at, window, dr.full(t.Bool, False, size)), goes_on, insert)
 
     def composite(
         self, window: list[list], basis: list[Scalar], T: Float, color: list[Float]

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import ClassVar
 
 import drjit as dr
@@ -488,17 +487,17 @@ class ImageModel:
     def footprint(
         self, geometry: list[Float], lanes: Lanes, active: Bool | bool
     ) -> MicroTileFootprint:
-        """Evaluate a splat at the pixels of each lane."""
-        return self.falloff.footprint(geometry, partial(self._offsets, lanes), active)
+        """Evaluate a splat at the pixels of each lane; with a period, where it is nearest."""
+
+        def offsets_from(x: Float, y: Float) -> tuple[list[Float], list[Float]]:
+            dx, dy = self.positions.offsets(lanes, x, y)
+            return [shortest(each, self.period) for each in dx], dy
+
+        return self.falloff.footprint(geometry, offsets_from, active)
 
     def nearest(self, x: Float, mean_x: Float) -> Float:
         """Return where a point at x, px, is seen next to a mean at ``mean_x``."""
         return x if self.period is None else mean_x + shortest(x - mean_x, self.period)
-
-    def _offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list[Float], list[Float]]:
-        """Return x and y, px, from a mean to the pixels; with a period, the nearest."""
-        dx, dy = self.positions.offsets(lanes, x, y)
-        return [shortest(each, self.period) for each in dx], dy
 
     def alphas(self, geometry: list[Float], footprint: MicroTileFootprint) -> Iterator[Alpha]:
         """Yield alpha at the 16 pixels.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import count
 from typing import TypeVar
 
 import drjit as dr
@@ -90,7 +91,8 @@ def make_lanes(
     t = types_of(Float)
     tiles = grid.tiles_of(range(grid.samples)) if tiles is None else tiles
     num_groups = len(tiles) // _GROUP  # the tiles beyond them come last
-    stride = _coprime_stride(max(num_groups, 1))
+    golden = max(1, round(num_groups * (math.sqrt(5) - 1) / 2))
+    stride = next(n for n in count(golden) if math.gcd(n, max(num_groups, 1)) == 1)
     lane = dr.arange(t.UInt32, len(tiles) * MICROS) if order is None else order
     turn, micro = lane // MICROS, lane % MICROS
     group = t.UInt64(turn // _GROUP) * dr.opaque(t.UInt64, stride)
@@ -101,14 +103,9 @@ def make_lanes(
     sample, tile = divide(tile, grid.num_tiles, grid.samples)
     columns = dr.opaque(t.UInt32, grid.columns)
     row = tile // columns
-    return Lanes(
-        micro_tile=micro_tile,
-        micro=micro,
-        tile=tile,
-        sample=sample,
-        x=(tile - row * columns) * TILE + (micro % GRID) * MICRO,
-        y=row * TILE + (micro // GRID) * MICRO,
-    )
+    x = (tile - row * columns) * TILE + (micro % GRID) * MICRO
+    y = row * TILE + (micro // GRID) * MICRO
+    return Lanes(micro_tile, micro, tile, sample, x, y)
 
 
 def group_by_work(Float: type, grid: TileGrid, work: UInt32, tiles: range | None = None) -> Lanes:
@@ -149,13 +146,6 @@ _BLOCK = 32 * MICROS
 same records, are too far apart; in smaller ones, lengths differ more."""
 
 _LEVELS = 256
-
-
-def _coprime_stride(count: int) -> int:
-    stride = max(1, round(count * (math.sqrt(5) - 1) / 2))
-    while math.gcd(stride, count) != 1:
-        stride += 1
-    return stride
 
 
 def load_pixels(plane: Float, lanes: Lanes, grid: TileGrid) -> list[Float]:

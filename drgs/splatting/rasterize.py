@@ -219,7 +219,9 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
         records=records,
         values=scatter_rows(columns, lanes.micro_tile, size),
         ends=scatter_rows(ends, lanes.micro_tile, size),
-        stop=scatter_rows([reduce(_larger, ends)], lanes.micro_tile, size),
+        stop=scatter_rows(
+            [reduce(lambda a, b: dr.select(b > a, b, a), ends)], lanes.micro_tile, size
+        ),
         count=count,
     )
     dr.eval(stored.values, stored.ends, stored.stop)
@@ -234,10 +236,6 @@ def sign_bits(value: Float) -> Int32:
 def any_unfinished(transmittances: list[Float]) -> Bool:
     """Return lanes with a transmittance that is not negative."""
     return reduce(and_, map(sign_bits, transmittances)) >= 0
-
-
-def _larger(a: UInt32, b: UInt32) -> UInt32:
-    return dr.select(b > a, b, a)
 
 
 SPARE_ROWS = 64  # behind the slots, for sums of lanes without a splat

@@ -60,11 +60,6 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
     return [splats.depths]
 
 
-def load_unchanged(rows: GaussianRows) -> GaussianRows:
-    """Return the Gaussians unchanged."""
-    return rows
-
-
 @dataclass(frozen=True)
 class Pipeline:
     """The stages and approximations of a rendering; see the module's description."""
@@ -72,7 +67,7 @@ class Pipeline:
     sh_degree: int = 3
     opacity_rule: OpacityRule = plain_opacity
     features: tuple[Feature, ...] = (color_features,)
-    rows: Callable[[GaussianRows], GaussianRows] = load_unchanged  # applied before projection
+    rows: Callable[[GaussianRows], GaussianRows] = lambda rows: rows  # applied before projection
     shape: FilmProjection = ewa  # projection of mean and covariance
     color: SplatColor = color_at_mean  # stored numbers of a splat's colour
     low_pass: float = LOW_PASS  # px^2
