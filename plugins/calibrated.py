@@ -257,10 +257,9 @@ class CalibratedSensor(mi.Sensor):
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         width, height = self.film().crop_size()
-        beside = []
-        for step in (mi.Vector2f(1 / width, 0), mi.Vector2f(0, 1 / height)):
-            other, _ = self.sample_ray(time, sample1, sample2 + step, sample3, active)
-            beside.append(other)
+        steps = mi.Vector2f(1 / width, 0), mi.Vector2f(0, 1 / height)
+        places = (sample2 + step for step in steps)
+        beside = [self.sample_ray(time, sample1, place, sample3, active)[0] for place in places]
         result = mi.RayDifferential3f(ray)
         result.o_x, result.o_y = (other.o for other in beside)
         result.d_x, result.d_y = (other.d for other in beside)

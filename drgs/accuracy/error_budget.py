@@ -71,11 +71,6 @@ class Level:
         return self.cost_ordered if is_ordered and self.cost_ordered else self.cost
 
 
-def cut_offs(alpha_cut: float, transmittance_stop: float) -> Changes:
-    """Return the values of both cut-offs."""
-    return {"alpha_cut": alpha_cut, "transmittance_stop": transmittance_stop}
-
-
 CENTER = Level({"order": "center"}, 1)
 WINDOWED = tuple(
     Level({"order": "pixel", "order_window": window}, cost)
@@ -85,11 +80,11 @@ WINDOWED = tuple(
 
 DIRECTIONS = (Level({"sh_direction": "mean"}, 1), Level({"sh_direction": "pixel"}, 3, 1.6))
 CUT_OFFS = (
-    Level(cut_offs(1 / 64, 1e-2), 0.87, 0.8),
-    Level(cut_offs(ALPHA_CUT, TRANSMITTANCE_STOP), 1),
-    Level(cut_offs(1 / 2048, 1e-6), 1.25, 1.45),
+    Level({"alpha_cut": 1 / 64, "transmittance_stop": 1e-2}, 0.87, 0.8),
+    Level({"alpha_cut": ALPHA_CUT, "transmittance_stop": TRANSMITTANCE_STOP}, 1),
+    Level({"alpha_cut": 1 / 2048, "transmittance_stop": 1e-6}, 1.25, 1.45),
 )
-FINEST_CUT_OFFS = cut_offs(1e-5, 1e-7)
+FINEST_CUT_OFFS = {"alpha_cut": 1e-5, "transmittance_stop": 1e-7}
 
 
 def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:

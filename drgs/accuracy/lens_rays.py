@@ -92,12 +92,9 @@ def lens_shape(
     slopes = lens.true_slopes(camera, position)
     film, kappa, h = seen_along(rows, camera, position, slopes, low_pass)
     depth, place = lens.depth_direction(own, position), film.means2d
-    jacobian = [
-        row + change * depth
-        for row, change in zip(
-            lens.projection_jacobian(own, position, slopes), place - dr.detach(place), strict=True
-        )
-    ]
+    jacobian = lens.projection_jacobian(own, position, slopes)
+    moves = place - dr.detach(place)
+    jacobian = [row + move * depth for row, move in zip(jacobian, moves, strict=True)]
     origin = lens.origin(camera, *place) if lens.parallel else None
     if (reading := camera.reading) is not None:
         jacobian = [reading.turn.T @ row for row in jacobian]
@@ -258,21 +255,16 @@ class LensRayFalloff(GaussianFalloff):
         del offsets_from
         splat = _SplatRows.unpack(geometry)
         log2_opacity = dr.select(active, self.log2_opacity(geometry), -dr.inf)
-        columns: list[list] = [[] for _ in range(12)]
-        for ray in self.rays:
-            for column, value in zip(columns, splat.peak(ray, log2_opacity), strict=True):
-                column.append(value)
-        u, v, log2_alpha, along, d_e1, d_e2, d_a, d_h, d_o1, d_o2, d_b, origins = columns
+        columns = zip(*(splat.peak(ray, log2_opacity) for ray in self.rays), strict=True)
+        u, v, log2_alpha, along, d_e1, d_e2, d_a, d_h, d_o1, d_o2, d_b, origins = map(list, columns)
         return LensRayFootprint(
             *([], [], u, v, log2_alpha, along, (d_e1, d_e2), d_a, d_h, (d_o1, d_o2), d_b, origins)
         )
 
     def peak(self, geometry: list[Float], x: Float, y: Float) -> tuple[Float, Float]:
         """Return the numerator and the denominator of a peak's depth at a place of the film, px."""
-        a, denominator, *_ = _SplatRows.unpack(geometry).crossing(
-            PixelRay.from_place(self.camera, x, y)
-        )
-        return a, denominator
+        splat = _SplatRows.unpack(geometry)
+        return splat.crossing(PixelRay.from_place(self.camera, x, y))[:2]
 
     @override
     def moments(
@@ -290,22 +282,15 @@ class LensRayFalloff(GaussianFalloff):
             (footprint.d_a, footprint.d_b, -1),
         ]
         sums, of_origins = [positions.sum(weights)], []
+        directions = [[ray.direction[k] for ray in self.rays] for k in range(3)]
         for d_ray, d_origin, sign in to_axes:
-            w = products(weights, d_ray)
-            terms = [
-                [each * ray.direction[k] for each, ray in zip(w, self.rays, strict=True)]
-                for k in range(3)
-            ]
+            terms = [products(products(weights, d_ray), along) for along in directions]
             if has_origins(self.camera):
                 w = products(weights, d_origin)
                 of_origins.append(positions.sum(w))
-                terms = [
-                    [
-                        x + sign * each * o[k]
-                        for x, each, o in zip(terms[k], w, footprint.origins, strict=True)
-                    ]
-                    for k in range(3)
-                ]
+                for k, term in enumerate(terms):
+                    triples = zip(term, w, footprint.origins, strict=True)
+                    terms[k] = [x + sign * each * o[k] for x, each, o in triples]
             sums += [positions.sum(term) for term in terms]
         return [*sums, positions.sum(products(weights, footprint.d_h)), *of_origins]
 

@@ -98,12 +98,9 @@ class RayColors(SplatFeatures):
         ]
         coefficients, others = totals[: self.num_coefficients], totals[self.num_coefficients :]
         d_basis = [(basis, d) for basis in self.basis[pixel] for d in d_colors]
-        return [
-            dr.fma(d, basis, total) for total, (basis, d) in zip(coefficients, d_basis, strict=True)
-        ] + [
-            dr.fma(weight, derivative, total)
-            for total, derivative in zip(others, g[CHANNELS:], strict=True)
-        ]
+        pairs = zip(coefficients, d_basis, strict=True)
+        sums = [dr.fma(d, basis, total) for total, (basis, d) in pairs]
+        return sums + super().add_derivatives(others, stored, pixel, weight, g[CHANNELS:])
 
     @override
     def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:

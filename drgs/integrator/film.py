@@ -126,8 +126,7 @@ def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) ->
         planes = [from_host(mi.Float, plane) for plane in channels.T]
         return np.array(develop_pixels(film, planes, aovs)).reshape(num_pixels, -1)
 
-    unit = np.eye(count, dtype=np.float32)
-    units = [develop(np.tile(channel, (num_pixels, 1)))[0] for channel in unit]
+    units = [develop(np.tile(unit, (num_pixels, 1)))[0] for unit in np.eye(count, dtype=np.float32)]
     matrix = np.stack(units, axis=1)
     mixed = np.linspace(0.1, 2, num_pixels * count, dtype=np.float32).reshape(num_pixels, count)
     if not np.allclose(develop(mixed), mixed @ matrix.T, rtol=1e-3, atol=1e-4):

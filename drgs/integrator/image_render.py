@@ -90,16 +90,9 @@ class ImageRender:
             samples = CenterSamples(film, maps, names)
         else:
             samples = DrawnSamples(sensor, seed, spp, maps, names)
-        whole = SensorRender(
-            splats=splats,
-            scene=scene,
-            index=0,
-            sensor=sensor,
-            positions=samples.positions,
-            key=samples.key,
-            has_alpha=mi.has_flag(film.flags(), mi.FilmFlags.Alpha),
-            nested=nested,
-        )
+        positions, key = samples.positions, samples.key
+        has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        whole = SensorRender(splats, scene, 0, sensor, positions, key, has_alpha, nested)
         batch, views = None, [whole]
         if is_batch(sensor):
             batch = SideBySide.from_batch(sensor)
@@ -500,12 +493,8 @@ def _mean(passes: Sequence[Passes]) -> Passes:
     for first in range(0, len(passes), PASSES_PER_KERNEL):
         dr.eval(total)
         terms = [*total, *passes[first : first + PASSES_PER_KERNEL]]
-        total = [
-            [
-                [_sum(values) for values in zip(*of_sample, strict=True)]
-                for of_sample in zip(*terms, strict=True)
-            ]
-        ]
+        by_sample = zip(*terms, strict=True)
+        total = [[[_sum(values) for values in zip(*one, strict=True)] for one in by_sample]]
     return [[value / len(passes) for value in of_sample] for of_sample in total[0]]
 
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import ArrayTypes, Rows, types_of
+from drgs.core.arrays import Rows, types_of
 from drgs.core.constants import COLOR_MIN
 from drgs.core.types import Array3f, Bool, Float, Scalar, UInt32
 from drgs.gaussians.parameters import quat_to_rotation
@@ -158,7 +158,12 @@ class RaySplats:
             return segment.active & more
 
         size = dr.width(walk.origin)
-        draws = [_Draw.without_splat(t, size) for _ in range(count)]
+        none = (
+            dr.zeros(t.UInt32, size),
+            dr.full(t.Float, dr.inf, size),
+            dr.full(t.Bool, False, size),
+        )
+        draws = [_Draw(*none) for _ in range(count)]
         state = walk.begin(), dr.zeros(t.Float, size), draws
         _, coverage, draws = walk.read_lists(state, should_continue, choose)
         basis = sh_basis(walk.direction, self.sh_degree)
@@ -319,9 +324,8 @@ class _Walk:
             # Equal peaks stay in the order of the list, by Gaussian.
             for place in window:
                 before = item[0] < place[0]
-                pairs = list(zip(place, item, strict=True))
-                kept.append([dr.select(before, new, old) for old, new in pairs])
-                item = [dr.select(before, old, new) for old, new in pairs]
+                kept.append(dr.select(before, item, place))
+                item = dr.select(before, place, item)
             return at, kept, overflows | (item[0] < dr.inf)
 
         def goes_on(at: _Place, window: list, overflows: Bool) -> Bool:
@@ -376,12 +380,6 @@ class _Draw:
     row: UInt32
     peak: Float  # inf: no splat
     is_stopped: Bool
-
-    @staticmethod
-    def without_splat(t: ArrayTypes, size: int) -> _Draw:
-        """Return the draw before the first entry of a list."""
-        none = dr.full(t.Float, dr.inf, size)
-        return _Draw(dr.zeros(t.UInt32, size), none, dr.full(t.Bool, False, size))
 
     def offer(self, row: UInt32, peak: Float, chances: _Chances, u: UInt32) -> _Draw:
         """Return the draw after another splat; u: a random number."""

@@ -56,11 +56,6 @@ class Plane:
         """Return the signed distance of a point."""
         return dr.dot(self.normal, point) - self.offset
 
-    def gather(self, mirror: mi.UInt32, active: mi.Bool | bool = True) -> Plane:
-        """Gather the planes of some of the mirrors."""
-        normal = dr.gather(mi.Vector3f, self.normal, mirror, active)
-        return Plane(normal, dr.gather(mi.Float, self.offset, mirror, active))
-
     def mirror(self, camera: Camera) -> Camera:
         """Mirror a camera, whose axes then have the other handedness."""
         n = self.normal
@@ -163,7 +158,9 @@ class Mirrors:
         for camera in cameras:
             pipeline = _pipeline(approximations, sh_degree, camera.lens)
             images = [
-                _render_mirror(camera, every.gather(mi.UInt32(k)), scene, gaussians, pipeline)
+                _render_mirror(
+                    camera, dr.gather(Plane, every, mi.UInt32(k)), scene, gaussians, pipeline
+                )
                 for k in range(len(mirrors))
             ]
             colors, ends = (dr.concat(parts) for parts in zip(*images, strict=True))
@@ -174,7 +171,7 @@ class Mirrors:
 
     def look(self, mirror: mi.UInt32, segment: PathSegment, active: mi.Bool) -> ProbeHit:
         """Look up the splats along segments that leave a mirror; mirror: its number."""
-        plane, ray = self.planes.gather(mirror, active), segment.ray
+        plane, ray = dr.gather(Plane, self.planes, mirror, active), segment.ray
         origin = ray.o - 2 * plane.height(ray.o) * plane.normal
         direction = ray.d - 2 * dr.dot(plane.normal, ray.d) * plane.normal
         color, coverage, is_known = mi.Color3f(0), mi.Float(0), mi.Bool(False)

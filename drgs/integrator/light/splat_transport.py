@@ -202,7 +202,10 @@ class ProbeTransport(SplatTransport):
             unknown = is_asked & ~seen.is_known
             radiance, T = self.fallback.composite_segment(segment, sample, unknown)
         color = mi.Color3f(seen.color)
-        color = dr.select(segment.is_open, _over_black(color, seen.coverage), color)
+        # Before black as the last splat: D(C), given A D(C / A) and A.
+        display = mi.math.linear_to_srgb(color / dr.select(seen.coverage > 0, seen.coverage, 1))
+        over_black = mi.math.srgb_to_linear(seen.coverage * display)
+        color = dr.select(segment.is_open, over_black, color)
         radiance = dr.select(is_known, self.radiance_scale * color, radiance)
         # An emitter's probe has transmittances of its light, but no view of splats from elsewhere.
         radiance = dr.select(is_reversed, 0, radiance)
@@ -378,9 +381,3 @@ def _center(node: mi.Emitter | mi.Shape) -> list[float]:
             f"{node.id()!r}, which is infinitely far away"
         )
     return np.array(box.center(), np.float64).ravel().tolist()
-
-
-def _over_black(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
-    """Decode with black as the last splat: return D(C), given A D(C / A) and A."""
-    display = mi.math.linear_to_srgb(color / dr.select(coverage > 0, coverage, 1))
-    return mi.math.srgb_to_linear(coverage * display)

@@ -367,16 +367,20 @@ class NestedSurfaces:
 
         Paths from behind windows have fewer bounces where ``max_depth`` can be set in Python.
         """
+        sampler = self.sensor.sampler()
+        sample_count = sampler.sample_count()
         for count in range(self.compositor.num_surfaces):
             sensor = self.sensor
             if self.surfaces.is_transparent:
                 sensor = sensor_behind(sensor, sensors_of(sensor), RaysBehind(self.rays, count))
             with (
-                _keep_sample_count(self.sensor),
                 _reduce_depth(self.integrator, count),
                 _reduce_depth(self.adjoint_integrator, count),
             ):
-                yield sensor
+                try:
+                    yield sensor
+                finally:  # the nested integrator sets its own
+                    sampler.set_sample_count(sample_count)
 
     @contextmanager
     def _differentiating(self) -> Iterator[list[Parameter]]:
@@ -406,14 +410,3 @@ def _reduce_depth(integrator: Any, count: int) -> Iterator[None]:
         yield
     finally:
         integrator.max_depth = depth
-
-
-@contextmanager
-def _keep_sample_count(sensor: mi.Sensor) -> Iterator[None]:
-    """Restore the sampler's sample count, which the nested integrator sets to its own."""
-    sampler = sensor.sampler()
-    count = sampler.sample_count()
-    try:
-        yield
-    finally:
-        sampler.set_sample_count(count)
