@@ -434,15 +434,10 @@ class Search:
         pairs = zip(self.front, errors, strict=True)
         front = [replace(one.choice, error=error) for one, error in pairs]
         chosen = front[place]
-        return BudgetReport(
-            budget,
-            chosen,
-            tuple(of_views),
-            next((one for one in front[place:] if one.error < CLEARLY * chosen.error), None),
-            next((one for one in front[place::-1] if one.cost < CLEARLY * chosen.cost), None),
-            self._best | self._most_samples,
-            math.sqrt(self._unordered.max()),
-        )
+        better = next((one for one in front[place:] if one.error < CLEARLY * chosen.error), None)
+        faster = next((one for one in front[place::-1] if one.cost < CLEARLY * chosen.cost), None)
+        best, uncertainty = self._best | self._most_samples, math.sqrt(self._unordered.max())
+        return BudgetReport(budget, chosen, tuple(of_views), better, faster, best, uncertainty)
 
     def measure(self, place: int) -> np.ndarray:
         """Return the measured square errors (V,) of a choice in the windows; place: in ``front``.

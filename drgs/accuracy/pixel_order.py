@@ -119,9 +119,7 @@ class PixelOrder(CenterOrder):
 
         T, C = _walk(
             inputs,
-            carry=lambda met, pixel: model.features.pixel_values(
-                met.features_at(pixel, model), pixel
-            ),
+            carry=lambda met, k: model.features.pixel_values(met.features_at(k, model), k),
             visit=visit,
             state=(inputs.transmittance(), inputs.zeros(count)),
             nothing=[dr.zeros(t.Float, size)] * count,
@@ -129,15 +127,10 @@ class PixelOrder(CenterOrder):
         dr.eval(T, C)
         columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
         last = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
-        return _OrderedTiles(
-            bins=bins,
-            records=records,
-            values=scatter_rows(columns, lanes.micro_tile, size),
-            ends=scatter_rows([last] * PIXELS, lanes.micro_tile, size),
-            stop=scatter_rows([last], lanes.micro_tile, size),
-            count=count,
-            lists=lists,
-        )
+        values = scatter_rows(columns, lanes.micro_tile, size)
+        ends = scatter_rows([last] * PIXELS, lanes.micro_tile, size)
+        stop = scatter_rows([last], lanes.micro_tile, size)
+        return _OrderedTiles(bins, records, values, ends, stop, count, lists)
 
     @override
     def adjoint(
@@ -244,13 +237,8 @@ class PixelLists:
         order = dr.gather(t.UInt32, by_depth, stable_order(lists, num_lists))
         entries, lists = (dr.gather(t.UInt32, c, order) for c in (entries, micro_tiles))
         dr.eval(entries, lists, order)
-        return PixelLists(
-            entries=entries,
-            order=order,
-            first_item=dr.gather(t.UInt32, first, bins.first_entry),
-            start=lower_bounds(lists, count, num_lists),
-            count=count,
-        )
+        first_item = dr.gather(t.UInt32, first, bins.first_entry)
+        return PixelLists(entries, order, first_item, lower_bounds(lists, count, num_lists), count)
 
 
 _LEVELS = 1 << 14
@@ -544,10 +532,7 @@ def _pairs(
 
     result = _walk(
         inputs,
-        carry=lambda met, pixel: [
-            _feature_gradient(inputs, met, pixel, g),
-            first_place + met.place,
-        ],
+        carry=lambda met, k: [_feature_gradient(inputs, met, k, g), first_place + met.place],
         visit=store,
         state=(inputs.transmittance(), *inputs.zeros(2)),
         nothing=[dr.zeros(t.Float, inputs.size), dr.zeros(t.UInt32, inputs.size)],

@@ -106,10 +106,7 @@ def pixels_adjoint(
         dr.gather(mi.Float, grad_in.array, pixel * len(matrix) + k) for k in range(len(matrix))
     ]
     return [
-        sum(
-            (float(weight) * d for weight, d in zip(column, developed, strict=True) if weight),
-            start=mi.Float(0),
-        )
+        sum((float(w) * d for w, d in zip(column, developed, strict=True) if w), mi.Float(0))
         for column in matrix.T
     ]
 

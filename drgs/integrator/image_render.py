@@ -429,21 +429,15 @@ class SensorRender:
     def _traced_surfaces(self, nested: NestedSurfaces) -> Cached[list[list[SurfaceLayers]]]:
         from drgs.integrator.light.visible_surfaces import trace_surfaces
 
-        state = self._camera_state
+        state, with_normals = self._camera_state, "normal" in self.splats.aovs.values()
         hides, (_, far) = self.splats.hide_emitters, depth_range(self.sensor)
-        return self.splats.cache.find(
-            f"surfaces {self.index}",
-            (nested.surfaces, self.key, hides, far, *state.settings),
-            state.device,
-            lambda: trace_surfaces(
-                nested.rays,
-                far,
-                self._film,
-                self._cameras(state),
-                self._offsets,
-                with_normals="normal" in self.splats.aovs.values(),
-            ),
-        )
+        settings = nested.surfaces, self.key, hides, far, *state.settings
+
+        def trace() -> list[list[SurfaceLayers]]:
+            view = self._film, self._cameras(state), self._offsets
+            return trace_surfaces(nested.rays, far, *view, with_normals)
+
+        return self.splats.cache.find(f"surfaces {self.index}", settings, state.device, trace)
 
     def num_surfaces(self, nested: NestedSurfaces) -> int:
         """Return the number of surfaces that are seen one through the other."""

@@ -162,6 +162,7 @@ def read_state(
         given = {name: props[name] for name in DECLARED if name in props}
         approximations = Approximations(**{**header, **given})
     settings = read(props, SETTINGS)
+    ignore, probes, shadows = (_words(props, name) for name in ("ignore", "probes", "shadows"))
     state = SplatsState(
         own=own,
         nested_objects=dict(objects),
@@ -174,12 +175,8 @@ def read_state(
         header=header,
         aovs=_aovs(props, [*AOVS, *feature_widths(every)]),
         given_error=parse_budget(props.get("error")),
-        ignore=_words(props, "ignore"),
-        lighting=LightSettings(
-            **read(props, LIGHT_SETTINGS),
-            probes=_words(props, "probes"),
-            shadows=_words(props, "shadows"),
-        ),
+        ignore=ignore,
+        lighting=LightSettings(**read(props, LIGHT_SETTINGS), probes=probes, shadows=shadows),
         **settings,
     )
     _check_settings(state)

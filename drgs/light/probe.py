@@ -329,9 +329,8 @@ def _vector_to(face: UInt32, right: Float, down: Float) -> Array3f:
     right, down = dr.select(is_negative, down, right), dr.select(is_negative, right, down)
     along = dr.select(is_negative, t.Float(-1), 1)
     values = [along, right, down]
-    return t.Array3f(
-        [
-            dr.select(axis == 0, values[k], dr.select(axis == 1, values[k - 1], values[k - 2]))
-            for k in range(3)
-        ]
-    )
+    turned = [
+        dr.select(axis == 0, values[k], dr.select(axis == 1, values[k - 1], values[k - 2]))
+        for k in range(3)
+    ]
+    return t.Array3f(turned)

@@ -105,15 +105,11 @@ class RaySplats:
             return at, last, T, color
 
         size = dr.width(walk.origin)
+        nothing = [dr.full(t.Float, -dr.inf, size), dr.zeros(t.UInt32, size)]
+        black = [dr.zeros(t.Float, size) for _ in range(3)]
+        state = walk.begin(), nothing, dr.select(segment.active, t.Float(1), -1), black
         _, _, T, color = dr.while_loop(
-            state=(
-                walk.begin(),
-                [dr.full(t.Float, -dr.inf, size), dr.zeros(t.UInt32, size)],
-                dr.select(segment.active, t.Float(1), -1),
-                [dr.zeros(t.Float, size) for _ in range(3)],
-            ),
-            cond=lambda at, last, T, color: (T > 0) & walk.should_continue(at),
-            body=body,
+            state, lambda at, last, T, color: (T > 0) & walk.should_continue(at), body
         )
         return t.Array3f(color), dr.abs(T)
 
@@ -158,12 +154,8 @@ class RaySplats:
             return segment.active & more
 
         size = dr.width(walk.origin)
-        none = (
-            dr.zeros(t.UInt32, size),
-            dr.full(t.Float, dr.inf, size),
-            dr.full(t.Bool, False, size),
-        )
-        draws = [_Draw(*none) for _ in range(count)]
+        row, peak = dr.zeros(t.UInt32, size), dr.full(t.Float, dr.inf, size)
+        draws = [_Draw(row, peak, dr.full(t.Bool, False, size)) for _ in range(count)]
         state = walk.begin(), dr.zeros(t.Float, size), draws
         _, coverage, draws = walk.read_lists(state, should_continue, choose)
         basis = sh_basis(walk.direction, self.sh_degree)
@@ -360,12 +352,10 @@ class _Walk:
 
         size = dr.width(T)
         nothing = [dr.full(t.Float, -dr.inf, size), dr.zeros(t.UInt32, size)]
-        _, T, color, last = dr.while_loop(
-            state=(window, T, color, nothing),
-            cond=lambda window, T, color, last: (window[0][0] < dr.inf) & (T > 0),
-            body=body,
-        )
-        return T, color, last
+        state = window, T, color, nothing
+        return dr.while_loop(
+            state, lambda window, T, *others: (window[0][0] < dr.inf) & (T > 0), body
+        )[1:]
 
 
 @dataclass

@@ -467,22 +467,15 @@ class ImageModel:
 
     def for_camera(self, camera: Camera) -> ImageModel:
         """Return this model for one camera."""
-        return replace(
-            self,
-            falloff=self.falloff.for_camera(camera),
-            features=self.features.for_camera(camera),
-            period=camera.lens.period(camera),
-        )
+        falloff, features = self.falloff.for_camera(camera), self.features.for_camera(camera)
+        return replace(self, falloff=falloff, features=features, period=camera.lens.period(camera))
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> ImageModel:
         """Return this model for the lanes of one kernel, with inputs loaded before the loop."""
         positions = self.positions.bind(lanes, grid)
-        return replace(
-            self,
-            falloff=self.falloff.bind(lanes, positions),
-            positions=positions,
-            features=self.features.bind(lanes, positions),
-        )
+        falloff = self.falloff.bind(lanes, positions)
+        features = self.features.bind(lanes, positions)
+        return replace(self, falloff=falloff, positions=positions, features=features)
 
     def footprint(
         self, geometry: list[Float], lanes: Lanes, active: Bool | bool

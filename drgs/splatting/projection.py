@@ -242,13 +242,8 @@ def factor_conic(
     determinant, added_determinant = dot(minors, minors), low_pass * (xx / yy + 1)
     p = dr.rsqrt(determinant + added_determinant)
     t = types_of(type(s))
-    return FilmShape(
-        means2d=means2d,
-        conic_factor=t.Array3f(p, -p * (xy / yy), s),
-        variances=t.Array2f(xx + low_pass, yy),
-        determinant=determinant,
-        added_determinant=added_determinant,
-    )
+    conic_factor, variances = t.Array3f(p, -p * (xy / yy), s), t.Array2f(xx + low_pass, yy)
+    return FilmShape(means2d, conic_factor, variances, determinant, added_determinant)
 
 
 def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:

@@ -214,18 +214,12 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
     columns[:PIXELS] = [dr.abs(T) for T in columns[:PIXELS]]
     ends = [ends[pixel] for pixel in range(PIXELS)]
     dr.eval(columns, ends)
-    stored = CompositedTiles(
-        bins=bins,
-        records=records,
-        values=scatter_rows(columns, lanes.micro_tile, size),
-        ends=scatter_rows(ends, lanes.micro_tile, size),
-        stop=scatter_rows(
-            [reduce(lambda a, b: dr.select(b > a, b, a), ends)], lanes.micro_tile, size
-        ),
-        count=count,
-    )
-    dr.eval(stored.values, stored.ends, stored.stop)
-    return stored
+    rows = scatter_rows(columns, lanes.micro_tile, size)
+    end_rows = scatter_rows(ends, lanes.micro_tile, size)
+    last = reduce(lambda a, b: dr.select(b > a, b, a), ends)
+    stops = scatter_rows([last], lanes.micro_tile, size)
+    dr.eval(rows, end_rows, stops)
+    return CompositedTiles(bins, records, rows, end_rows, stops, count)
 
 
 def sign_bits(value: Float) -> Int32:

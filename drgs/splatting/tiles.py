@@ -368,13 +368,8 @@ def lower_bounds(sorted_tiles: UInt32, num_entries: int, num_tiles: int) -> UInt
         smaller = dr.gather(UInt32, sorted_tiles, middle) < tile
         return dr.select(smaller, middle + 1, first), dr.select(smaller, last, middle)
 
-    first, _ = dr.while_loop(
-        state=(dr.zeros(UInt32, num_tiles + 1), dr.opaque(UInt32, num_entries, num_tiles + 1)),
-        cond=lambda first, last: first < last,
-        body=body,
-        labels=("first", "last"),
-    )
-    return first
+    bounds = dr.zeros(UInt32, num_tiles + 1), dr.opaque(UInt32, num_entries, num_tiles + 1)
+    return dr.while_loop(bounds, lambda first, last: first < last, body, ("first", "last"))[0]
 
 
 @dataclass
@@ -467,12 +462,8 @@ def count_entries(entries: Entries) -> UInt32:
         return group + 1, count + dr.popcnt(entries._open(group).word)
 
     UInt32 = type(entries.first)
-    _, count = dr.while_loop(
-        state=(UInt32(entries.first), dr.zeros(UInt32, dr.width(entries.first))),
-        cond=lambda group, count: group <= entries.last,
-        body=body,
-    )
-    return count
+    state = UInt32(entries.first), dr.zeros(UInt32, dr.width(entries.first))
+    return dr.while_loop(state, lambda group, count: group <= entries.last, body)[1]
 
 
 def find_lowest_bit(word: UInt32) -> UInt32:

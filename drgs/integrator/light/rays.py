@@ -82,11 +82,8 @@ class StraightRays:
             active = active & hit.is_valid() & (T > MAX_INVISIBLE_OPACITY)
             return self.continue_rays(ray, hit, active), T, active
 
-        _, T, _ = dr.while_loop(
-            state=(mi.Ray3f(ray), dr.full(mi.Float, 1, dr.width(ray)), mi.Bool(active)),
-            cond=lambda ray, T, active: active,
-            body=pass_surface,
-        )
+        state = mi.Ray3f(ray), dr.full(mi.Float, 1, dr.width(ray)), mi.Bool(active)
+        _, T, _ = dr.while_loop(state, lambda ray, T, active: active, pass_surface)
         return dr.select(T > MAX_INVISIBLE_OPACITY, T, 0)
 
     def _meet(
