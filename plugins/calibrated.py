@@ -226,16 +226,10 @@ class CalibratedSensor(mi.Sensor):
         per_length = 1 / dr.norm(direction)
         near, far = lens.ray_range(direction * per_length, self.near, self.far)
         direction = camera.rotation.T @ (direction * per_length)
-        wavelengths, weight = self.sample_wavelengths(
-            dr.zeros(mi.SurfaceInteraction3f), sample1, active
-        )
-        ray = mi.Ray3f(
-            o=mi.Point3f(camera.center) + direction * near,
-            d=mi.Vector3f(direction),
-            maxt=far - near,
-            time=time,
-            wavelengths=wavelengths,
-        )
+        nothing = dr.zeros(mi.SurfaceInteraction3f)
+        wavelengths, weight = self.sample_wavelengths(nothing, sample1, active)
+        start, towards = mi.Point3f(camera.center) + direction * near, mi.Vector3f(direction)
+        ray = mi.Ray3f(o=start, d=towards, maxt=far - near, time=time, wavelengths=wavelengths)
         return ray, weight & seen
 
     def _time_of(self, camera: Camera, time: Float, y: Float) -> Float:

@@ -255,14 +255,9 @@ def crop(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
     """Return the camera of a window of the film."""
     t = types_of(type(camera.near))
     offset = t.Array2f(dr.opaque(t.Float, x), dr.opaque(t.Float, y))
-    return replace(
-        camera,
-        principal=camera.principal - offset,
-        film_start=camera.film_start - offset,
-        film_end=camera.film_end - offset,
-        width=width,
-        height=height,
-    )
+    places = ("principal", "film_start", "film_end")
+    moved = {name: getattr(camera, name) - offset for name in places}
+    return replace(camera, width=width, height=height, **moved)
 
 
 def bound(errors: Sequence[float] | np.ndarray) -> float:
@@ -369,13 +364,12 @@ class Search:
 
     def _differences(self, changes: Changes, target: Changes, step: int = 1) -> np.ndarray:
         """Return the mean square differences (V,) of views, from those of their windows."""
-        return np.array(
-            [
-                view.mean_square(self._image(k, changes, False), self._image(k, target, False))
-                for k, view in enumerate(self._views)
-                if k % step == 0
-            ]
-        )
+        found = [
+            view.mean_square(self._image(k, changes, False), self._image(k, target, False))
+            for k, view in enumerate(self._views)
+            if k % step == 0
+        ]
+        return np.array(found)
 
     def _squares(self, levels: Sequence[Level], finest: Changes) -> list[LevelSquares]:
         """Return those of levels, of every other view for two unless nothing is estimated."""

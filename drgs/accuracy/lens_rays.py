@@ -276,11 +276,8 @@ class LensRayFalloff(GaussianFalloff):
         respect to the splat's o'_1, o'_2 and -b.
         """
         assert isinstance(footprint, LensRayFootprint), "made by self.footprint"
-        to_axes = [
-            (footprint.d_e[0], footprint.d_o[0], 1),
-            (footprint.d_e[1], footprint.d_o[1], 1),
-            (footprint.d_a, footprint.d_b, -1),
-        ]
+        (d_e1, d_e2), (d_o1, d_o2) = footprint.d_e, footprint.d_o
+        to_axes = (d_e1, d_o1, 1), (d_e2, d_o2, 1), (footprint.d_a, footprint.d_b, -1)
         sums, of_origins = [positions.sum(weights)], []
         directions = [[ray.direction[k] for ray in self.rays] for k in range(3)]
         for d_ray, d_origin, sign in to_axes:
@@ -488,10 +485,8 @@ def _ellipse_around(points: Sequence[Array2f]) -> tuple[Array2f, Array3f, Bool]:
     columns = [math.sqrt(2 / count) * (point - center) for point in points]
     across, down = [c.x for c in columns], [c.y for c in columns]
     p, r, s = factor_conic(center, across, down, MIN_OUTLINE_VARIANCE).conic_factor
-    radii = [
-        math.sqrt(count / 2) * dr.norm(t.Array2f(dr.fma(p, x, r * y), s * y))
-        for x, y in zip(across, down, strict=True)
-    ]
+    whitened = (t.Array2f(dr.fma(p, x, r * y), s * y) for x, y in zip(across, down, strict=True))
+    radii = [math.sqrt(count / 2) * dr.norm(offset) for offset in whitened]
     least, largest = reduce(dr.minimum, radii), reduce(dr.maximum, radii)
     scale = 1 / (OUTLINE_MARGIN + largest + (largest - least) / 2)
     fits = largest < MAX_OUTLINE_DEVIATION * (least + OUTLINE_MARGIN)

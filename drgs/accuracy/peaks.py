@@ -145,9 +145,8 @@ class AffineDepths:
 
     def _pixel_depths(self, footprint: MicroTileFootprint, keys: list[Float]) -> list[Float]:
         coordinates = zip(footprint.u, footprint.v, strict=True)
-        return [
-            a / denominator for a, denominator in (self._depth_ratio(keys, *e) for e in coordinates)
-        ]
+        ratios = (self._depth_ratio(keys, *e) for e in coordinates)
+        return [a / denominator for a, denominator in ratios]
 
     @staticmethod
     def _depth_ratio(keys: list[Float], u: Float, v: Float) -> tuple[Float, Float]:

@@ -436,18 +436,13 @@ def _walk(
 
     size = inputs.size
     empty = [dr.full(t.Float, -dr.inf, size), dr.zeros(t.Float, size), *nothing]
-    _, _, state, _ = dr.while_loop(
-        state=(
-            begin,
-            [[[type(x)(x) for x in empty] for _ in range(order.window)] for _ in range(PIXELS)],
-            state,
-            dr.full(t.Bool, True, size),
-        ),
-        # After the last splat, the window still has to be emptied.
-        cond=lambda place, queue, state, go_on: (place < end + order.window) & go_on,
-        body=body,
-    )
-    return state
+    queue = [[[type(x)(x) for x in empty] for _ in range(order.window)] for _ in range(PIXELS)]
+    # After the last splat, the window still has to be emptied.
+    return dr.while_loop(
+        (begin, queue, state, dr.full(t.Bool, True, size)),
+        lambda place, queue, state, go_on: (place < end + order.window) & go_on,
+        body,
+    )[2]
 
 
 def _insert(places: list[list[Float]], item: list[Float]) -> tuple[list[list[Float]], list[Float]]:

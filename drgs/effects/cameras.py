@@ -194,12 +194,9 @@ class CameraRefinement(OptimisedEffect):
         if view.motion is not None:
             between = np.linalg.solve(view.camera_to_world, view.motion.close_to_world)
             motion = mi.Matrix4f(between.astype(np.float32))
-        start = _Start(
-            to_world=mi.Matrix4f(view.camera_to_world.astype(np.float32)),
-            motion=motion,
-            intrinsics=mi.Vector4f(*(float(getattr(view, name)) for name in INTRINSICS)),
-            size=mi.Vector2f(view.width, view.height),
-        )
+        to_world = mi.Matrix4f(view.camera_to_world.astype(np.float32))
+        intrinsics = mi.Vector4f(*(float(getattr(view, name)) for name in INTRINSICS))
+        start = _Start(to_world, motion, intrinsics, mi.Vector2f(view.width, view.height))
         dr.make_opaque(start)
         return start
 

@@ -109,12 +109,10 @@ class ColorCorrection(CenteredEffect):
         exposures = gains.mean(axis=1)
         by_view = trimmed_deviation(exposures - np.median(exposures))
         by_color = float((gains - exposures[:, None]).std())
-        return Finding(
-            "exposure and white balance",
-            f"brightness differs by {by_view:.1%}, colours by {by_color:.1%}",
-            is_likely=by_view > MIN_BRIGHTNESS_DEVIATION or by_color > MIN_COLOR_DEVIATION,
-            changes={"colors.lr": EXAMINED_LR},
-        )
+        evidence = f"brightness differs by {by_view:.1%}, colours by {by_color:.1%}"
+        is_likely = by_view > MIN_BRIGHTNESS_DEVIATION or by_color > MIN_COLOR_DEVIATION
+        changes = {"colors.lr": EXAMINED_LR}
+        return Finding("exposure and white balance", evidence, is_likely, changes)
 
     def __init__(self, config: ColorConfig, num_views: int) -> None:
         """num_views: of the training split."""

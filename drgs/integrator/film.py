@@ -102,9 +102,8 @@ def pixels_adjoint(
     """
     matrix = film_map(film, maps, aovs)
     pixel = dr.arange(mi.UInt32, grad_in.shape[0] * grad_in.shape[1])
-    developed = [
-        dr.gather(mi.Float, grad_in.array, pixel * len(matrix) + k) for k in range(len(matrix))
-    ]
+    count = len(matrix)
+    developed = [dr.gather(mi.Float, grad_in.array, pixel * count + k) for k in range(count)]
     return [
         sum((float(w) * d for w, d in zip(column, developed, strict=True) if w), mi.Float(0))
         for column in matrix.T
@@ -220,10 +219,8 @@ class DrawnSamples(CenterSamples):
             return [[repeat_array(d, point.samples) for d in of_sample] for point in self.points]
         # The image is linear in the channels: their values do not matter.
         num_channels = num_colors(self.film) + len(self.aovs)
-        passes = [
-            [dr.opaque(mi.Float, 0, dr.width(point.x)) for _ in range(num_channels)]
-            for point in self.points
-        ]
+        widths = [dr.width(point.x) for point in self.points]
+        passes = [[dr.opaque(mi.Float, 0, n) for _ in range(num_channels)] for n in widths]
         with dr.resume_grad():
             dr.enable_grad(passes)
             image = self.develop(passes)

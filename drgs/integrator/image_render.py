@@ -246,10 +246,8 @@ class SensorRender:
         with dr.resume_grad():
             state = self._state()
             is_attached = state.is_attached
-        by_time = [
-            rendering.frames_adjoint(self.splats.gaussians, *of_time, is_attached)
-            for of_time in zip(self.frames, d_planes, strict=True)
-        ]
+        gaussians, times = self.splats.gaussians, zip(self.frames, d_planes, strict=True)
+        by_time = [rendering.frames_adjoint(gaussians, *of_time, is_attached) for of_time in times]
         of_cameras = [gradients.camera for gradients in by_time if gradients.camera]
         if of_cameras:
             with dr.resume_grad():
@@ -259,10 +257,8 @@ class SensorRender:
     def splats_backward(self, d_channels: Passes) -> list[SplatGradients]:
         """Return derivatives with respect to the 2D splats, by time; add the background's."""
         d_planes = self._planes_backward(d_channels)
-        return [
-            rendering.splats_adjoint(*of_time)
-            for of_time in zip(self.frames, d_planes, strict=True)
-        ]
+        times = zip(self.frames, d_planes, strict=True)
+        return [rendering.splats_adjoint(*of_time) for of_time in times]
 
     def _planes_backward(self, d_channels: Passes) -> Planes:
         """Return derivatives with respect to the planes; accumulate the background's."""

@@ -196,10 +196,8 @@ def entry(flat: Float, index: int) -> Float:
 
 def product(matrix: Float, vector: list[Float], start: int = 0) -> list[Float]:
     """Multiply by a square matrix, flat from ``start`` on."""
-    rows = [
-        [entry(matrix, start + j * len(vector) + k) for k in range(len(vector))]
-        for j in range(len(vector))
-    ]
+    size = len(vector)
+    rows = [[entry(matrix, start + j * size + k) for k in range(size)] for j in range(size)]
     terms = [[a * x for a, x in zip(row, vector, strict=True)] for row in rows]
     return [reduce(operator.add, of_row) for of_row in terms]
 

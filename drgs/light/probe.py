@@ -277,9 +277,8 @@ def _face(
     forward, right, down = (np.eye(3)[(axis + k) % 3] for k in range(3))
     if is_negative:
         forward, right, down = -forward, down, right
-    K = np.array(
-        [[CUBE_SIZE_TEXELS / 2, 0, edge / 2], [0, CUBE_SIZE_TEXELS / 2, edge / 2], [0, 0, 1]]
-    )
+    focal, middle = CUBE_SIZE_TEXELS / 2, edge / 2
+    K = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
     camera = Camera.create(Float, np.stack([right, down, forward]), center, K, edge, edge, near)
     T, *color, depth = rendering.render(gaussians, camera, pipeline).planes()
     coverage = 1 - T

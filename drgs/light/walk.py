@@ -289,9 +289,8 @@ class _Walk:
         o = Array3f([dr.dot(row, offset) for row in W])
         d = Array3f([dr.dot(row, self.direction) for row in W])
         peak = -dr.dot(o, d) / dr.squared_norm(d)
-        log2_alpha = dr.fma(
-            dr.squared_norm(dr.fma(d, peak, o)), -0.5 * math.log2(math.e), log2_opacity
-        )
+        squared = dr.squared_norm(dr.fma(d, peak, o))
+        log2_alpha = dr.fma(squared, -0.5 * math.log2(math.e), log2_opacity)
         shows = log2_alpha >= self.splats.cutoffs.log2_floor(log2_opacity)
         return peak, dr.select(shows, log2_alpha, -dr.inf)
 
@@ -342,9 +341,8 @@ class _Walk:
         def body(window: list, T: Float, color: list, last: list) -> tuple:
             (peak, row, log2_alpha), *others = window
             active = peak < dr.inf
-            weight, T, _ = composite_step(
-                T, self.alpha(log2_alpha), self.splats.cutoffs.transmittance_stop
-            )
+            stop = self.splats.cutoffs.transmittance_stop
+            weight, T, _ = composite_step(T, self.alpha(log2_alpha), stop)
             seen = self.splats._color(row, basis, active)
             shown = [dr.fma(weight, c, total) for c, total in zip(seen, color, strict=True)]
             gone = [dr.full(t.Float, dr.inf, dr.width(peak)), row, log2_alpha]

@@ -445,9 +445,7 @@ class SplatFeatures:
         weight: T alpha; g: derivatives of the loss with respect to the pixel's planes.
         """
         del stored, pixel
-        return [
-            dr.fma(weight, derivative, total) for derivative, total in zip(g, totals, strict=True)
-        ]
+        return [dr.fma(weight, d, total) for d, total in zip(g, totals, strict=True)]
 
     def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:
         """Return tangents of the features at a pixel."""

@@ -150,9 +150,8 @@ _LEVELS = 256
 
 def load_pixels(plane: Float, lanes: Lanes, grid: TileGrid) -> list[Float]:
     """The 16 values of a row-major plane of all samples in each micro-tile; 0 off the film."""
-    return [
-        dr.gather(type(plane), plane, index, inside) for index, inside in pixels_of(lanes, grid)
-    ]
+    pixels = pixels_of(lanes, grid)
+    return [dr.gather(type(plane), plane, index, inside) for index, inside in pixels]
 
 
 def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[UInt32, Bool]]:

@@ -179,9 +179,8 @@ def project(
     seen, position, depth = camera.lens.visibility(camera, camera.rotation @ offset)
     low_pass = max(low_pass, MIN_LOW_PASS_PX2)
     film = (shape or ewa)(rows, camera, position, low_pass)
-    opacities = opacity_rule(
-        _sigmoid(rows.logit_opacities), film.determinant, film.added_determinant
-    )
+    opacity = _sigmoid(rows.logit_opacities)
+    opacities = opacity_rule(opacity, film.determinant, film.added_determinant)
     if rows.opacity_compensation is not None:
         opacities = opacities * rows.opacity_compensation
     above_cut = opacities > least_alpha

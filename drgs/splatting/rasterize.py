@@ -200,15 +200,12 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
                 ends[pixel] = dr.select(goes_on & active, entry + 1, ends[pixel])
         return cursor, values, ends, signs >= 0
 
+    cursor = entries.begin()
+    ends = dr.alloc_local(t.UInt32, PIXELS, dr.zeros(t.UInt32, size))
     _, values, ends, _ = dr.while_loop(
-        state=(
-            entries.begin(),
-            start,
-            dr.alloc_local(t.UInt32, PIXELS, dr.zeros(t.UInt32, size)),
-            dr.full(t.Bool, True, size),
-        ),
-        cond=lambda cursor, values, ends, unfinished: entries.pending(cursor) & unfinished,
-        body=body,
+        (cursor, start, ends, dr.full(t.Bool, True, size)),
+        lambda cursor, values, ends, unfinished: entries.pending(cursor) & unfinished,
+        body,
     )
     columns = [values[planes * pixel + k] for k in range(planes) for pixel in range(PIXELS)]
     columns[:PIXELS] = [dr.abs(T) for T in columns[:PIXELS]]

@@ -59,15 +59,10 @@ class Plane:
     def mirror(self, camera: Camera) -> Camera:
         """Mirror a camera, whose axes then have the other handedness."""
         n = self.normal
-        turned = [
-            list(axis - 2 * dr.dot(axis, n) * n) for axis in map(mi.Vector3f, camera.rotation)
-        ]
-        center = mi.Vector3f(camera.center)
-        return replace(
-            camera,
-            rotation=type(camera.rotation)(turned),
-            center=type(camera.center)(center - 2 * self.height(center) * n),
-        )
+        axes, center = map(mi.Vector3f, camera.rotation), mi.Vector3f(camera.center)
+        rotation = type(camera.rotation)([list(axis - 2 * dr.dot(axis, n) * n) for axis in axes])
+        center = type(camera.center)(center - 2 * self.height(center) * n)
+        return replace(camera, rotation=rotation, center=center)
 
 
 @dataclass(frozen=True)
@@ -121,10 +116,8 @@ def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
     middle = points.mean(0)
     offsets = points - middle
     extents, axes = np.linalg.eigh(offsets.T @ offsets)  # from the least on
-    slack = (
-        MAX_RELATIVE_DEPARTURE * np.abs(offsets).max()
-        + MAX_ROUNDING_DEPARTURE * np.abs(points).max()
-    )
+    slack = MAX_RELATIVE_DEPARTURE * np.abs(offsets).max()
+    slack += MAX_ROUNDING_DEPARTURE * np.abs(points).max()
     if extents[1] <= 1e-10 * extents[2] or np.abs(offsets @ axes[:, 0]).max() > slack:
         return None
     return axes[:, 0].tolist(), float(axes[:, 0] @ middle)
@@ -246,10 +239,8 @@ def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> ren
 
 def _enlarge(camera: Camera, scale: float) -> Camera:
     factor = dr.opaque(mi.Float, scale)
-    changes = {
-        name: factor * getattr(camera, name) + BORDER_TEXELS
-        for name in ("principal", "film_start", "film_end")
-    }
+    places = ("principal", "film_start", "film_end")
+    changes = {name: factor * getattr(camera, name) + BORDER_TEXELS for name in places}
     camera = replace(
         camera,
         focal=factor * camera.focal,

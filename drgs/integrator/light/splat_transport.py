@@ -103,10 +103,8 @@ class RayTransport(SplatTransport):
     ) -> tuple[mi.Color3f, mi.Float]:
         seed, n = reinterpret(mi.UInt32, sample), max(self.num_samples, MIN_DRAWN_SPLATS)
         drawn, exist, T = self.splats.sample_splats(segment, seed, n)
-        colors = [
-            dr.select(is_open & ~exists, 0, mi.Color3f(color))
-            for color, exists in zip(drawn, exist, strict=True)
-        ]
+        pairs = zip(drawn, exist, strict=True)
+        colors = [dr.select(is_open & ~exists, 0, mi.Color3f(color)) for color, exists in pairs]
         s1, s2, s3 = (sum((color**k for color in colors), mi.Color3f(0)) for k in (1, 2, 3))
         mean = s1 / n
         square = (s1 * s1 - s2) / (n * (n - 1))
@@ -274,9 +272,8 @@ def _probes(
             from drgs.effects.smoothing import apply_smoothing
 
             pipeline = replace(pipeline, rows=apply_smoothing)
-        probes = Probes.render(
-            gaussians, pipeline, centers, splats.near, mi.math.srgb_to_linear, planes
-        )
+        linear = mi.math.srgb_to_linear
+        probes = Probes.render(gaussians, pipeline, centers, splats.near, linear, planes)
         _warn_of_close(splats, objects, flat, probes)
         return probes
 
