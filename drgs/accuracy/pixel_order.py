@@ -567,9 +567,7 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Float], g: list[list[Float]]) -
     return partials
 
 
-def _sum_items(
-    inputs: _WalkInputs, partials: Rows, before: SplatGradients | None
-) -> SplatGradients:
+def _sum_items(inputs: _WalkInputs, rows: Rows, before: SplatGradients | None) -> SplatGradients:
     lists, places = inputs.lists, inputs.lists.places()
     UInt32 = type(places)
 
@@ -577,9 +575,9 @@ def _sum_items(
         first_place = sample * dr.opaque(UInt32, lists.count)
 
         def load(item: UInt32) -> list[Float]:
-            return partials.load(first_place + dr.gather(UInt32, places, item))
+            return rows.load(first_place + dr.gather(UInt32, places, item))
 
-        return sum_runs(partials.Float, lists.first_item, rank, load)
+        return sum_runs(rows.Float, lists.first_item, rank, load)
 
     return splat_gradients(inputs.bins, totals, len(inputs.samples), before)
 

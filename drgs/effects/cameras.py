@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from pydantic import Field
-from typing_extensions import override
+from typing_extensions import Self, override
 
 from drgs.cameras.motion import rotation_matrix
 from drgs.cameras.viewpoints import OPENCV_TO_MITSUBA
@@ -146,9 +146,7 @@ class CameraRefinement(OptimisedEffect):
 
     @classmethod
     @override
-    def from_config(
-        cls, config: FitConfig, dataset: Dataset, section: CamerasConfig
-    ) -> CameraRefinement:
+    def from_config(cls, config: FitConfig, dataset: Dataset, section: CamerasConfig) -> Self:
         return cls(section, len(dataset.train), dataset.extent)
 
     @classmethod

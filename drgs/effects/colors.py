@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, cast
 import drjit as dr
 import numpy as np
 from pydantic import Field
-from typing_extensions import override
+from typing_extensions import Self, override
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.section import Rate, Section, Weight
@@ -96,9 +96,7 @@ class ColorCorrection(CenteredEffect):
 
     @classmethod
     @override
-    def from_config(
-        cls, config: FitConfig, dataset: Dataset, section: ColorConfig
-    ) -> ColorCorrection:
+    def from_config(cls, config: FitConfig, dataset: Dataset, section: ColorConfig) -> Self:
         return cls(section, len(dataset.train))
 
     @classmethod

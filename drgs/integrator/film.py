@@ -151,17 +151,15 @@ def split_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[Sampl
     return tuple(passes)
 
 
-def split_samples(
-    positions: Sequence[SamplePoints], passes: Sequence[Channels]
-) -> Iterator[Channels]:
+def split_samples(points: Sequence[SamplePoints], passes: Sequence[Channels]) -> Iterator[Channels]:
     """Divide the channels of passes into those of each sample, Float (H * W,)."""
-    for points, channels in zip(positions, passes, strict=True):
-        if points.samples == 1:
+    for point, channels in zip(points, passes, strict=True):
+        if point.samples == 1:
             yield channels
             continue
         dr.eval(channels)
-        num_pixels = dr.width(points.x) // points.samples
-        for sample in range(points.samples):
+        num_pixels = dr.width(point.x) // point.samples
+        for sample in range(point.samples):
             pixel = dr.arange(mi.UInt32, num_pixels) + dr.opaque(mi.UInt32, sample * num_pixels)
             yield [dr.gather(mi.Float, p, pixel, mode=dr.ReduceMode.Permute) for p in channels]
 

@@ -177,13 +177,11 @@ def nested_surfaces(
     return NestedSurfaces.from_scene(splats, scene, sensor, seed, spp)
 
 
-def check_image(
-    width: int, height: int, spp: int, poses: int, num_aovs: int, nested_spp: int
-) -> None:
+def check_image(width: int, height: int, spp: int, poses: int, aovs: int, nested_spp: int) -> None:
     """Raise PluginError for an image that does not fit into memory.
 
-    width, height: px; spp: of the splats; poses: of the sensor; num_aovs: channels besides colour
-    and alpha; nested_spp: of the nested integrator, 0 for none.
+    width, height: px; spp: of the splats; poses: of the sensor; aovs: channels besides colour and
+    alpha; nested_spp: of the nested integrator, 0 for none.
     """
     if min(width, height) < 1:
         raise PluginError(f"splats: the film must have 1 pixel at least, got {width} x {height}")
@@ -198,7 +196,7 @@ def check_image(
             f"splats: a pixel can have at most {MAX_SAMPLES:,} samples, got {spp:,}{times}; take "
             "the mean of images with other seeds, or, for surfaces alone, set nested_spp"
         )
-    why = too_large_reason(width, height, 3 + num_aovs, spp * poses)
+    why = too_large_reason(width, height, 3 + aovs, spp * poses)
     if why is not None:
         raise PluginError(f"splats: {why}")
     samples, most = width * height * nested_spp, MAX_LANES

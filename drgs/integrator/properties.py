@@ -136,9 +136,7 @@ UNNAMED = "_arg_"  # prefix of Mitsuba's names for nested objects without one
 
 
 def read_state(
-    props: mi.Properties,
-    objects: Mapping[str, SplatObject],
-    nested: Sequence[mi.SamplingIntegrator],
+    props: mi.Properties, objects: Mapping[str, SplatObject], nested: list[mi.SamplingIntegrator]
 ) -> SplatsState:
     """Return the state of ``splats``; objects: nested ``splats``; nested: other integrators."""
     for former, name in FORMER_NAMES.items():

@@ -24,8 +24,8 @@ from drgs.cameras.camera import Camera
 from drgs.core.arrays import ArrayTypes, types_of
 from drgs.core.types import Array3f, Bool, Float, UInt32
 from drgs.gaussians.parameters import Gaussians
-from drgs.splatting import rendering
 from drgs.splatting.projection import GaussianRows
+from drgs.splatting.rendering import Pipeline, render
 
 CUBE_SIZE_TEXELS = 256  # texels of an edge of the largest cube
 NUM_LEVELS = 7  # cubes of a probe, each with half the edge of the one before
@@ -61,7 +61,7 @@ class Probes:
     @staticmethod
     def render(
         gaussians: Gaussians,
-        pipeline: rendering.Pipeline,
+        pipeline: Pipeline,
         centers: np.ndarray,
         near: float,
         decode: Callable[[Float], Float],
@@ -172,9 +172,7 @@ class Probes:
         return dr.select(meets, high, end), meets, is_known
 
 
-def _clip_to_plane(
-    t: ArrayTypes, plane: np.ndarray, pipeline: rendering.Pipeline
-) -> rendering.Pipeline:
+def _clip_to_plane(t: ArrayTypes, plane: np.ndarray, pipeline: Pipeline) -> Pipeline:
     """Return a pipeline without the Gaussians whose means are on the other side of a plane."""
     *normal, offset = (dr.opaque(t.Float, float(value)) for value in plane)
 
@@ -266,7 +264,7 @@ def _face(
     center: np.ndarray,
     number: int,
     gaussians: Gaussians,
-    pipeline: rendering.Pipeline,
+    pipeline: Pipeline,
     near: float,
     decode: Callable[[Float], Float],
 ) -> list[Float]:
@@ -280,7 +278,7 @@ def _face(
     focal, middle = CUBE_SIZE_TEXELS / 2, edge / 2
     K = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
     camera = Camera.create(Float, np.stack([right, down, forward]), center, K, edge, edge, near)
-    T, *color, depth = rendering.render(gaussians, camera, pipeline).planes()
+    T, *color, depth = render(gaussians, camera, pipeline).planes()
     coverage = 1 - T
     shows = coverage > 0
     color = [decode(c / dr.select(shows, coverage, 1)) for c in color]

@@ -219,20 +219,16 @@ def _wrap_columns(
 
 
 def _make_entries(
-    first_entry: UInt32,
-    boxes: Rows,
-    rows: Rows,
-    num_entries: int,
-    grid: TileGrid,
-    model: ImageModel,
+    first_entry: UInt32, boxes: Rows, rows: Rows, count: int, grid: TileGrid, model: ImageModel
 ) -> tuple[UInt32, UInt32]:
     """Return the tile of each entry, and two words: see :func:`_pack`.
 
-    Padding entries are in the last tile and touch nothing: a stable sort leaves them at the end.
+    count: of entries. Padding entries are in the last tile and touch nothing: a stable sort leaves
+    them at the end.
     """
     t = types_of(rows.Float)
     # Rank of each entry: write each rank at the start of its run, then a running maximum.
-    padded = -(-max(num_entries, 1) // WORD) * WORD
+    padded = -(-max(count, 1) // WORD) * WORD
     rank = dr.arange(t.UInt32, dr.width(first_entry) - 1)
     start, end = dr.gather(t.UInt32, first_entry, rank), dr.gather(t.UInt32, first_entry, rank + 1)
     starts = dr.zeros(t.UInt32, padded)
@@ -253,7 +249,7 @@ def _make_entries(
     tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
     geometry = rows.load(rank)[: model.falloff.num_geometry]
     mask = _touched_micros(geometry, tile_x, tile_y, grid, model)
-    exists = entry < dr.opaque(t.UInt32, num_entries)
+    exists = entry < dr.opaque(t.UInt32, count)
     tile = dr.select(exists, tile, dr.opaque(t.UInt32, grid.num_tiles - 1))
     entries = interleave(_pack(rank, tile, dr.select(exists, mask, 0)))
     dr.eval(tile, entries)

@@ -29,7 +29,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.light.rays import PathSegment, StraightRays, has_transparent_parts
 from drgs.integrator.sensors import SensorState, camera_from_sensor
 from drgs.light.probe import LOW_PASS, ProbeHit, bilinear_texels
-from drgs.splatting import rendering
+from drgs.splatting.rendering import Pipeline, render
 
 TEXELS_PER_PIXEL = 2  # texels per pixel of a small film, along either axis
 
@@ -228,7 +228,7 @@ def _is_same(distance: mi.Float, far: mi.Float, end: mi.Float) -> mi.Bool:
     return dr.select((far < dr.inf) & (end < dr.inf), is_near, (far < dr.inf) == (end < dr.inf))
 
 
-def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> rendering.Pipeline:
+def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> Pipeline:
     """Build the pipeline that renders Gaussians as rays meet them, as far as a lens allows."""
     projection = "exact"
     if not isinstance(lens, Pinhole):
@@ -253,11 +253,7 @@ def _enlarge(camera: Camera, scale: float) -> Camera:
 
 
 def _render_mirror(
-    camera: Camera,
-    plane: Plane,
-    scene: mi.Scene,
-    gaussians: Gaussians,
-    pipeline: rendering.Pipeline,
+    camera: Camera, plane: Plane, scene: mi.Scene, gaussians: Gaussians, pipeline: Pipeline
 ) -> tuple[mi.Float, mi.Float]:
     """Render the splats that the camera sees in a mirror: see :class:`_View`."""
     side = dr.sign(plane.height(mi.Vector3f(camera.center)))
@@ -269,7 +265,7 @@ def _render_mirror(
     assert isinstance(pipeline.order, PixelOrder), "see _pipeline"
     depths = replace(pipeline.order.depths, bounds=(nearest, farthest))
     order = replace(pipeline.order, depths=depths)
-    T, *color = rendering.render(gaussians, camera, replace(pipeline, order=order)).planes()
+    T, *color = render(gaussians, camera, replace(pipeline, order=order)).planes()
     coverage = 1 - T
     color = mi.Color3f(color) / dr.select(coverage > 0, coverage, 1)
     color = coverage * mi.math.srgb_to_linear(color)

@@ -279,13 +279,10 @@ class NestedSurfaces:
                 num_paths = count or sensor.sampler().sample_count()
                 transport = transport_of(splats, scene, num_paths, sensors_of(sensor))
             nested.use_transport(transport)
-        compositor = SurfaceCompositor(
-            sensor.film(),
-            cache.film_maps,
-            splats.aov_names(),
-            shows_background=not hide_emitters and scene.environment() is not None,
-            display_space=not splats.srgb_primitives,
-        )
+        shows_background = not hide_emitters and scene.environment() is not None
+        film, maps, names = sensor.film(), cache.film_maps, splats.aov_names()
+        display_space = not splats.srgb_primitives
+        compositor = SurfaceCompositor(film, maps, names, shows_background, display_space)
         traced = surfaces.scene_to_trace(scene)
         rays = StraightRays(traced, hide_emitters, hide_emitters or surfaces.is_transparent)
         return NestedSurfaces(surfaces, nested, adjoint, sensor, seed, count, compositor, rays)
