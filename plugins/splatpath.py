@@ -263,9 +263,7 @@ class _Path:
         """Return the vertex; attached: to the surfaces of this vertex and the last."""
         si = self.hit.compute_surface_interaction(self.ray, ray_flags=mi.RayFlags.All)
         if attached:
-            last = self.last_hit.compute_surface_interaction(
-                self.last_ray, ray_flags=mi.RayFlags.Minimal
-            )
+            last = self.last_hit.compute_surface_interaction(self.last_ray, mi.RayFlags.Minimal)
             here = dr.detach(si)
             moved = here.to_local(dr.normalize(last.p - here.p))
             si.wi = _replace_grad(si.wi, dr.select(self.depth >= 1, moved, si.wi))
@@ -321,9 +319,7 @@ class _Step:
     def relative_change(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Spectrum:
         """Return 1, attached to the relative change of the light that the vertex reflects."""
         bsdf, is_delta = si.bsdf(ray), self.is_delta
-        next_si = self.hit.compute_surface_interaction(
-            self.ray, ray_flags=mi.RayFlags.Minimal, active=self.active
-        )
+        next_si = self.hit.compute_surface_interaction(self.ray, mi.RayFlags.Minimal, self.active)
         # A moving vertex sees the next one in another solid angle.
         next_si = dr.detach(next_si)
         hits = self.active & next_si.is_valid() & ~is_delta
@@ -363,9 +359,8 @@ def _attach_sample(
     moved.d = dr.select(ds.delta, again.d, moved.d)
     ds = _replace_grad(ds, moved)
     # Samples are points of the emitter: a moving vertex sees them in another solid angle.
-    jacobian = solid_angle_to_area_jacobian(
-        si.p, dr.detach(ds.p), dr.detach(ds.n), active & is_surface
-    )
+    p, n = dr.detach(ds.p), dr.detach(ds.n)
+    jacobian = solid_angle_to_area_jacobian(si.p, p, n, active & is_surface)
     emitted = scene.eval_emitter_direction(si, ds, active)
     density = dr.select(ds.pdf != 0, dr.rcp(dr.detach(ds.pdf)), 0)
     weight = _replace_grad(weight, dr.select(ds.delta, of_lamp, emitted * density))

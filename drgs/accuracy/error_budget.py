@@ -210,11 +210,6 @@ class MeasuredView:
         end_y, end_x = min(y + _cell_size(height), height), min(x + _cell_size(width), width)
         return MeasuredView(camera, (x, y, end_x - x, end_y - y), float(shares[cell]))
 
-    def cut(self, image: np.ndarray) -> np.ndarray:
-        """Return the window of an image of the view."""
-        x, y, width, height = self.window
-        return image[y : y + height, x : x + width]
-
     def mean_square(self, one: np.ndarray, other: np.ndarray) -> float:
         """Return the mean square difference of the view from images (H, W, 3) of its window."""
         total = float(np.square(one - other, dtype=np.float64).sum())
@@ -356,7 +351,8 @@ class Search:
         if is_whole or self.bound is max or key in images:
             if key not in images:
                 images[key] = self._renderer.image(view.camera, values)
-            return images[key] if is_whole else view.cut(images[key])
+            x, y, width, height = view.window
+            return images[key] if is_whole else images[key][y : y + height, x : x + width]
         key = (*key, view.window)
         if key not in images:
             images[key] = self._renderer.image(view.camera, values, window=view.window)

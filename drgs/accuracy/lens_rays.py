@@ -411,11 +411,9 @@ class _SplatRows:
     def cylinder(self, reach: Float, count: int) -> tuple[list[Array3f], Bool | bool]:
         """Return the same for parallel rays, whose peaks are at 1 + kappa . e times the depth."""
         (kx, ky), size = self.kappa, dr.sqrt(reach)
-        mean, peaks = self._point(type(size)(0), type(size)(0)), []
-        for x, y in _circle(count):
-            u, v = size * x, size * y
-            peaks.append(self._point(u, v) + dr.fma(kx, u, ky * v) * mean)
-        return peaks, True
+        mean = self._point(type(size)(0), type(size)(0))
+        edge = ((size * x, size * y) for x, y in _circle(count))
+        return [self._point(u, v) + dr.fma(kx, u, ky * v) * mean for u, v in edge], True
 
     def _point(self, u: Float, v: Float) -> Array3f:
         """Return the point of the plane n . x = 1 with the coordinates e = (u, v)."""

@@ -209,13 +209,6 @@ class PixelLists:
         first = dr.gather(UInt32, self.start, number)
         return first, dr.gather(UInt32, self.start, number + 1)
 
-    def places(self) -> UInt32:
-        """Return the map from an item as made to its place in the lists, (items,)."""
-        UInt32, size = type(self.order), dr.width(self.order)
-        places = dr.empty(UInt32, size)
-        dr.scatter(places, dr.arange(UInt32, size), self.order)
-        return places
-
     @staticmethod
     def build(bins: TileBins, records: Records, depths: AffineDepths) -> PixelLists:
         """Make the lists. The host reads one value, the number of items."""
@@ -568,8 +561,10 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Float], g: list[list[Float]]) -
 
 
 def _sum_items(inputs: _WalkInputs, rows: Rows, before: SplatGradients | None) -> SplatGradients:
-    lists, places = inputs.lists, inputs.lists.places()
-    UInt32 = type(places)
+    lists = inputs.lists
+    UInt32, size = type(lists.order), dr.width(lists.order)
+    places = dr.empty(UInt32, size)  # (items,): item as made -> place in the lists
+    dr.scatter(places, dr.arange(UInt32, size), lists.order)
 
     def totals(rank: UInt32, sample: UInt32) -> list[Float]:
         first_place = sample * dr.opaque(UInt32, lists.count)

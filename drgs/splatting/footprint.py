@@ -384,11 +384,9 @@ class SplatFeatures:
         composited unchanged.
         """
         more, plain = num_stored - self.num_planes(num_stored), SplatFeatures()
-        groups = []
-        for first in range(0, max(num_stored - more, 1), size):
-            planes = list(range(num_stored - more))[first : first + size]
-            stored = [more + plane for plane in planes]
-            groups.append(FeatureGroup(stored, planes, plain))
+        numbers, starts = range(num_stored - more), range(0, max(num_stored - more, 1), size)
+        parts = [list(numbers[first : first + size]) for first in starts]
+        groups = [FeatureGroup([more + plane for plane in part], part, plain) for part in parts]
         groups[0] = FeatureGroup([*range(more), *groups[0].stored], groups[0].planes, self)
         return groups
 

@@ -40,14 +40,9 @@ class TileGrid:
         return -(-self.width // TILE)
 
     @property
-    def rows(self) -> int:
-        """Tiles in a column."""
-        return -(-self.height // TILE)
-
-    @property
     def num_tiles(self) -> int:
         """Tiles on the film."""
-        return self.columns * self.rows
+        return self.columns * -(-self.height // TILE)
 
     @property
     def num_pixels(self) -> int:
@@ -158,12 +153,9 @@ def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[UInt32, Bool]]:
     """Return index (in a plane of all samples) and on-film mask of each micro-tile's 16 pixels."""
     UInt32 = type(lanes.x)
     width, height = dr.opaque(UInt32, grid.width), dr.opaque(UInt32, grid.height)
-    first_row, pixels = lanes.sample * height, []
-    for pixel in range(PIXELS):
-        row, column = divmod(pixel, MICRO)
-        x, y = lanes.x + column, lanes.y + row
-        pixels.append(((first_row + y) * width + x, (x < width) & (y < height)))
-    return pixels
+    first_row = lanes.sample * height
+    places = ((lanes.x + k % MICRO, lanes.y + k // MICRO) for k in range(PIXELS))
+    return [((first_row + y) * width + x, (x < width) & (y < height)) for x, y in places]
 
 
 def load_lane_row(values: T, micro_tile: UInt32, planes: int) -> list[T]:

@@ -269,7 +269,8 @@ def composite_adjoint(
     bins = tiles.bins
     pairs = CompositedPairs.find(bins, tiles.stop, samples)
     bands = split_bands(bins, pairs)
-    sums = Rows.empty(bins.rows.Float, bins.num_sums, max(pairs.num_rows, 1))
+    num_rows = int(pairs.row[dr.width(pairs.row) - 1])  # waits for the device
+    sums = Rows.empty(bins.rows.Float, bins.num_sums, max(num_rows, 1))
     for band in bands:
         slots = assign_slots(pairs, band)
         partials = _partials(tiles, slots, d_planes)
