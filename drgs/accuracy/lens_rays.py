@@ -42,13 +42,7 @@ from functools import reduce
 import drjit as dr
 from typing_extensions import override
 
-from drgs.accuracy.peaks import (
-    MAX_EXPONENT,
-    UNBOUNDED_OUTLINE,
-    AffineDepths,
-    bounding_cone,
-    seen_along,
-)
+from drgs.accuracy.peaks import MAX_EXPONENT, OPEN_OUTLINE, AffineDepths, bounding_cone, seen_along
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Perspective
 from drgs.core.arrays import types_of
@@ -228,7 +222,7 @@ class LensRayFalloff(GaussianFalloff):
         offsets = [dr.select(bounded, offset, 0) for offset in offsets]
         center, factor, is_ellipse = _ellipse_around(offsets)
         found = [*(place + center), *(dr.sqrt(reach) * factor)]
-        everywhere = [x, y, UNBOUNDED_OUTLINE, 0, UNBOUNDED_OUTLINE]
+        everywhere = [x, y, OPEN_OUTLINE, 0, OPEN_OUTLINE]
         bounded &= is_ellipse
         return [dr.select(bounded, a, b) for a, b in zip(found, everywhere, strict=True)]
 

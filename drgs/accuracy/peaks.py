@@ -30,7 +30,7 @@ MAX_ECCENTRICITY = 0.99
 """Outlines of a larger squared eccentricity are treated as unbounded. At the limit, an ellipse is
 ten times as long as wide, and its size accurate to 1e-5 in single precision. It also limits t h."""
 
-UNBOUNDED_OUTLINE = 1e-12  # 1 / px: U of an outline that holds every film
+OPEN_OUTLINE = 1e-12  # 1 / px: U of an outline that holds every film
 
 MAX_EXPONENT = 1e4  # 2^-1e4 is 0 in either precision
 

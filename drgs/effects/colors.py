@@ -194,7 +194,5 @@ class _TransformColors(dr.CustomOp):
     def _rows(matrix: TensorXf) -> list[list[Float]]:
         """Return the numbers as arrays of one entry, that are not compiled into the kernel."""
         flat = matrix.array
-        UInt32 = types_of(type(flat)).UInt32
-        return [
-            [dr.gather(type(flat), flat, UInt32(4 * i + j)) for j in range(4)] for i in range(3)
-        ]
+        t = types_of(type(flat))
+        return [[dr.gather(t.Float, flat, t.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]

@@ -399,15 +399,9 @@ def check_shapes(gaussians: Gaussians) -> None:
     num = next(iter(gaussians.means.shape), 1)
     if num == 0:
         raise PluginError("splats: at least one Gaussian is needed, got none")
-    rows = {
-        "means": [(3,)],
-        "quats": [(4,)],
-        "log_scales": [(3,)],
-        "logit_opacities": [()],
-        "sh0": [(1, 3)],
-        "shN": [((degree + 1) ** 2 - 1, 3) for degree in range(4)],
-        **({} if gaussians.smoothing is None else {"smoothing": [()]}),
-    }
+    harmonics = {"sh0": [(1, 3)], "shN": [((degree + 1) ** 2 - 1, 3) for degree in range(4)]}
+    rows = {"means": [(3,)], "quats": [(4,)], "log_scales": [(3,)], "logit_opacities": [()]}
+    rows |= harmonics | ({} if gaussians.smoothing is None else {"smoothing": [()]})
     for name, allowed in rows.items():
         got = tuple(getattr(gaussians, name).shape)
         if got not in [(num, *row) for row in allowed]:

@@ -344,14 +344,9 @@ def project(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
     opacities = sigmoid(gaussians.logit_opacities)
     if antialiased:
         opacities = opacities * areas / np.sqrt(dets)
-    return Projection(
-        means2d=camera.film_points(affine.means),
-        cov2d=cov2d,
-        conics=_inverses(cov2d, dets),
-        depths=(gaussians.means - camera.center) @ camera.rotation[2],
-        opacities=opacities,
-        visible=affine.in_front & (opacities > ALPHA_CUT),
-    )
+    means2d, visible = camera.film_points(affine.means), affine.in_front & (opacities > ALPHA_CUT)
+    depths = (gaussians.means - camera.center) @ camera.rotation[2]
+    return Projection(means2d, cov2d, _inverses(cov2d, dets), depths, opacities, visible)
 
 
 def widened_covariances(

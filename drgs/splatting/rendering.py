@@ -383,9 +383,7 @@ def frames_tangent(
     return tangents_with_rays(frames, direction, camera_tangents)
 
 
-def _columns_of(
-    d_rows: GaussianRows, gaussians: Gaussians, visible: Bool
-) -> dict[str, list[Float]]:
+def _columns_of(d_rows: GaussianRows, like: Gaussians, visible: Bool) -> dict[str, list[Float]]:
     """Return per-lane derivatives by parameter, column by column.
 
     The gradient of invisible rows is zero, also if their values are not finite; so is that of SH
@@ -393,7 +391,7 @@ def _columns_of(
     """
     t = types_of(type(d_rows.logit_opacities))
     columns = _parameter_columns(d_rows)
-    missing = 3 * gaussians.shN.shape[1] - len(columns["shN"])
+    missing = 3 * like.shN.shape[1] - len(columns["shN"])
     columns["shN"] += [t.Float(0)] * missing if columns["shN"] else []
     columns["smoothing"] = [] if d_rows.smoothing is None else [d_rows.smoothing]
     columns |= d_rows.features or {}
