@@ -105,13 +105,9 @@ class LensChange:
 
     def apply(self, view: View) -> View:
         """Return the view with this lens."""
-        return replace(
-            view,
-            fx=view.fx * self.focal[0],
-            fy=view.fy * self.focal[1],
-            cx=view.cx + self.principal[0] * view.width,
-            cy=view.cy + self.principal[1] * view.height,
-        )
+        (wide, tall), (right, down) = self.focal, self.principal
+        cx, cy = view.cx + right * view.width, view.cy + down * view.height
+        return replace(view, fx=view.fx * wide, fy=view.fy * tall, cx=cx, cy=cy)
 
 
 @dataclass(frozen=True)

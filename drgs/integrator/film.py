@@ -104,10 +104,8 @@ def pixels_adjoint(
     pixel = dr.arange(mi.UInt32, grad_in.shape[0] * grad_in.shape[1])
     count = len(matrix)
     developed = [dr.gather(mi.Float, grad_in.array, pixel * count + k) for k in range(count)]
-    return [
-        sum((float(w) * d for w, d in zip(column, developed, strict=True) if w), mi.Float(0))
-        for column in matrix.T
-    ]
+    columns = (zip(column, developed, strict=True) for column in matrix.T)
+    return [sum((float(w) * d for w, d in column if w), mi.Float(0)) for column in columns]
 
 
 def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) -> np.ndarray:

@@ -121,9 +121,8 @@ class Probes:
             return start * (1 - u) + towards * u
 
         active &= dr.dot(dr.gather(t.Array3f, self.normals, probe, active), direction) >= 0
-        u, meets, is_known = self._search(
-            place, end, _Cube.from_level(probe, dr.minimum(level, LAST_DISTANCE_LEVEL)), active
-        )
+        cube = _Cube.from_level(probe, dr.minimum(level, LAST_DISTANCE_LEVEL))
+        u, meets, is_known = self._search(place, end, cube, active)
         is_known &= active
         v, texels = place(u), _Cube.from_level(probe, level).bilinear_texels(place(u))
         colors = [w * dr.gather(t.Array4f, self.colors, texel, is_known) for texel, w in texels]

@@ -374,11 +374,8 @@ class _Draw:
         replaces = u < dr.select(self.is_stopped, 0, chances.replaces)
         competes = u < dr.select(self.is_stopped, chances.stops, chances.competes)
         takes = replaces | (competes & (peak < self.peak))
-        return _Draw(
-            dr.select(takes, row, self.row),
-            dr.select(takes, peak, self.peak),
-            self.is_stopped | (u < chances.stops),
-        )
+        row, peak = dr.select(takes, row, self.row), dr.select(takes, peak, self.peak)
+        return _Draw(row, peak, self.is_stopped | (u < chances.stops))
 
 
 @dataclass(frozen=True)

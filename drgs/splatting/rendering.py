@@ -81,16 +81,9 @@ class Pipeline:
 
     def project(self, rows: GaussianRows, camera: Camera) -> Splats2D:
         """Project with this pipeline's approximations."""
-        splats = project(
-            self.rows(rows),
-            camera.for_means(rows.means),
-            self.sh_degree,
-            self.opacity_rule,
-            self.shape,
-            self.color,
-            self.low_pass,
-            self.model.cutoffs.least_alpha,
-        )
+        prepared, moved = self.rows(rows), camera.for_means(rows.means)
+        stages = self.sh_degree, self.opacity_rule, self.shape, self.color, self.low_pass
+        splats = project(prepared, moved, *stages, self.model.cutoffs.least_alpha)
         if rows.features:
             numbers = [number for columns in rows.features.values() for number in columns]
             finite = dr.isfinite(dr.detach(sum(numbers[1:], numbers[0])))
@@ -323,15 +316,11 @@ def weighted_sums(frame: Frame, *planes: Float) -> list[Float]:
 def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
     """Add the derivatives of a loss that depends on several cameras."""
     sums = {name: v + b.parameters.arrays[name] for name, v in a.parameters.arrays.items()}
-    total = GaussianGradients(
-        parameters=Gaussians.from_arrays(sums),
-        means2d=a.means2d + b.means2d,
-        visible=a.visible | b.visible,
-        first_nonfinite=dr.select(
-            a.first_nonfinite < b.first_nonfinite, a.first_nonfinite, b.first_nonfinite
-        ),
-        # Derivatives of the cameras are separate.
-    )
+    means2d, visible = a.means2d + b.means2d, a.visible | b.visible
+    first, other = a.first_nonfinite, b.first_nonfinite
+    least = dr.select(first < other, first, other)
+    # Derivatives of the cameras are separate.
+    total = GaussianGradients(Gaussians.from_arrays(sums), means2d, visible, least)
     dr.eval(total)
     return total
 

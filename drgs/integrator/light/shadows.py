@@ -89,15 +89,13 @@ class _Estimate:
         normals: mi.Vector3f,
         let_through: Callable[[mi.Ray3f, mi.Float], mi.Float],
     ) -> tuple[mi.Color3f, mi.Color3f]:
-        sampler = mi.load_dict({"type": "independent"})
+        scene, sampler = self.scene.scene, mi.load_dict({"type": "independent"})
         sampler.seed(0, dr.width(points))
         place = dr.zeros(mi.SurfaceInteraction3f, dr.width(points))
         place.p = points
 
         def body(k: mi.UInt32, lit: mi.Color3f, dark: mi.Color3f, sampler: mi.Sampler) -> tuple:
-            ds, weight = self.scene.scene.sample_emitter_direction(
-                place, sampler.next_2d(), False, True
-            )
+            ds, weight = scene.sample_emitter_direction(place, sampler.next_2d(), False, True)
             cosine = dr.dot(normals, ds.d)  # the normal is as long as the splat is thick
             start = points + SHADOW_OFFSET_STDS * dr.sign(cosine) * normals
             ray = mi.Ray3f(mi.Ray3f(start, ds.d), ds.dist * (1 - mi.math.ShadowEpsilon))

@@ -234,11 +234,9 @@ class ProbeTransport(SplatTransport):
             dr.select(is_reversed, 0, self._level(segment.pdf)),
             is_asked & ~mirrored.is_known,
         )
-        seen = ProbeHit(
-            dr.select(mirrored.is_known, mirrored.color, seen.color),
-            dr.select(mirrored.is_known, mirrored.coverage, seen.coverage),
-            seen.is_known | mirrored.is_known,
-        )
+        color = dr.select(mirrored.is_known, mirrored.color, seen.color)
+        coverage = dr.select(mirrored.is_known, mirrored.coverage, seen.coverage)
+        seen = ProbeHit(color, coverage, seen.is_known | mirrored.is_known)
         return seen, is_asked, is_reversed
 
     def _look_in_mirrors(self, probe: mi.UInt32, segment: PathSegment, active: mi.Bool) -> ProbeHit:

@@ -238,9 +238,8 @@ class SurfaceCompositor:
 def _apply_map(matrix: np.ndarray, planes: list[mi.Float]) -> list[mi.Float]:
     if not planes or np.array_equal(matrix, np.eye(3)):
         return planes
-    return [
-        sum((float(m) * p for m, p in zip(row, planes, strict=True)), mi.Float(0)) for row in matrix
-    ]
+    rows = (zip(row, planes, strict=True) for row in matrix)
+    return [sum((float(m) * p for m, p in row), mi.Float(0)) for row in rows]
 
 
 @dataclass(frozen=True)
