@@ -26,9 +26,8 @@ def register(variant: str) -> None:
         module_name = f"{__name__}.{variant}.{name}"
         if module_name in sys.modules:
             continue
-        spec = importlib.util.spec_from_file_location(
-            module_name, Path(__file__).with_name(f"{name}.py")
-        )
+        file = Path(__file__).with_name(f"{name}.py")
+        spec = importlib.util.spec_from_file_location(module_name, file)
         assert spec is not None and spec.loader is not None, "of a Python file"
         module = importlib.util.module_from_spec(spec)
         sys.modules[module_name] = module

@@ -226,16 +226,10 @@ class CalibratedSensor(mi.Sensor):
         per_length = 1 / dr.norm(direction)
         near, far = lens.ray_range(direction * per_length, self.near, self.far)
         direction = camera.rotation.T @ (direction * per_length)
-        wavelengths, weight = self.sample_wavelengths(
-            dr.zeros(mi.SurfaceInteraction3f), sample1, active
-        )
-        ray = mi.Ray3f(
-            o=mi.Point3f(camera.center) + direction * near,
-            d=mi.Vector3f(direction),
-            maxt=far - near,
-            time=time,
-            wavelengths=wavelengths,
-        )
+        nothing = dr.zeros(mi.SurfaceInteraction3f)
+        wavelengths, weight = self.sample_wavelengths(nothing, sample1, active)
+        start, towards = mi.Point3f(camera.center) + direction * near, mi.Vector3f(direction)
+        ray = mi.Ray3f(o=start, d=towards, maxt=far - near, time=time, wavelengths=wavelengths)
         return ray, weight & seen
 
     def _time_of(self, camera: Camera, time: Float, y: Float) -> Float:
@@ -257,10 +251,9 @@ class CalibratedSensor(mi.Sensor):
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         width, height = self.film().crop_size()
-        beside = []
-        for step in (mi.Vector2f(1 / width, 0), mi.Vector2f(0, 1 / height)):
-            other, _ = self.sample_ray(time, sample1, sample2 + step, sample3, active)
-            beside.append(other)
+        steps = mi.Vector2f(1 / width, 0), mi.Vector2f(0, 1 / height)
+        places = (sample2 + step for step in steps)
+        beside = [self.sample_ray(time, sample1, place, sample3, active)[0] for place in places]
         result = mi.RayDifferential3f(ray)
         result.o_x, result.o_y = (other.o for other in beside)
         result.d_x, result.d_y = (other.d for other in beside)

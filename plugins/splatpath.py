@@ -13,6 +13,7 @@ from mitsuba.ad.integrators.common import (  # pyright: ignore[reportMissingImpo
     solid_angle_to_area_jacobian,
 )
 
+from drgs.config.approximations import Declared
 from drgs.core.environment import check_variant
 from drgs.core.errors import UnsupportedError
 from drgs.integrator.light.rays import (
@@ -22,14 +23,14 @@ from drgs.integrator.light.rays import (
     StraightRays,
     has_transparent_parts,
 )
-from drgs.integrator.properties import flag, integer, read, refuse_unknown
+from drgs.integrator.properties import integer, read, refuse_unknown
 
 T = TypeVar("T")
 
 PROPERTIES = {
     "max_depth": integer(-1, least=-1),
     "rr_depth": integer(5, least=1),
-    "hide_emitters": flag(False),
+    "hide_emitters": Declared(False),
 }
 
 MAX_SURVIVAL_PROBABILITY = 0.95  # largest probability of Russian roulette, as in Mitsuba's ``path``
@@ -99,10 +100,11 @@ class SplatPathIntegrator(RBIntegrator):
             with dr.resume_grad(when=not primal):
                 si = path.vertex(attached=not primal)
             splats, arrives = self._pass_splats(scene, path, sampler)
-            emitted = self._emitted_radiance(scene, path, si, arrives, primal)
+            here = _Vertex(scene, path, si, arrives)
+            emitted = self._emitted_radiance(here, primal)
             goes_on = path.active & (path.depth + 1 < self.max_depth) & si.is_valid()
-            direct = self._direct(scene, sampler, path, si, arrives, goes_on, primal)
-            step = self._bounce(scene, sampler, path, si, arrives)
+            direct = self._direct(here, sampler, goes_on, primal)
+            step = self._bounce(here, sampler)
             passed = dr.select(step.is_null, 0, splats)  # or composited with what follows
             is_seen |= goes_on & ~step.is_null
             contribution = dr.detach(passed + emitted + direct)
@@ -147,32 +149,20 @@ class SplatPathIntegrator(RBIntegrator):
             last_is_delta=mi.Bool(True),
         )
 
-    def _emitted_radiance(
-        self,
-        scene: mi.Scene,
-        path: _Path,
-        si: mi.SurfaceInteraction3f,
-        arrives: mi.Spectrum,
-        primal: bool,
-    ) -> mi.Spectrum:
+    def _emitted_radiance(self, here: _Vertex, primal: bool) -> mi.Spectrum:
+        scene, path, si = here.scene, here.path, here.si
         shows = path.active & ~((path.depth == 0) & ~si.is_valid() & self.hide_emitters)
         ds = mi.DirectionSample3f(scene, si=si, ref=path.last_si)
         pdf = scene.pdf_emitter_direction(path.last_si, ds, ~path.last_is_delta)
         weight = mis_weight(path.last_pdf, pdf)
         with dr.resume_grad(when=not primal):
-            return arrives * weight * ds.emitter.eval(si, shows)
+            return here.arrives * weight * ds.emitter.eval(si, shows)
 
     def _direct(
-        self,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        path: _Path,
-        si: mi.SurfaceInteraction3f,
-        arrives: mi.Spectrum,
-        active: mi.Bool,
-        primal: bool,
+        self, here: _Vertex, sampler: mi.Sampler, active: mi.Bool, primal: bool
     ) -> mi.Spectrum:
-        bsdf = si.bsdf(path.ray)
+        scene, si = here.scene, here.si
+        bsdf = si.bsdf(here.path.ray)
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         rays, numbers = StraightRays(scene, False, self.sees_through), sampler.next_2d()
         ds, weight = scene.sample_emitter_direction(si, numbers, not rays.sees_through, active)
@@ -190,16 +180,10 @@ class SplatPathIntegrator(RBIntegrator):
             wo = si.to_local(ds.d)
             value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
             mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-            return arrives * mis * value * weight * let_through
+            return here.arrives * mis * value * weight * let_through
 
-    def _bounce(
-        self,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        path: _Path,
-        si: mi.SurfaceInteraction3f,
-        arrives: mi.Spectrum,
-    ) -> _Step:
+    def _bounce(self, here: _Vertex, sampler: mi.Sampler) -> _Step:
+        scene, path, si = here.scene, here.path, here.si
         has_bounces = path.depth + 1 < self.max_depth
         may_pass = mi.Bool(self.sees_through)
         active = path.active & si.is_valid() & (has_bounces | may_pass)
@@ -209,7 +193,7 @@ class SplatPathIntegrator(RBIntegrator):
         ray = si.spawn_ray(si.to_world(sample.wo))
         is_null = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
         eta = path.eta * sample.eta
-        throughput = dr.select(is_null, path.throughput, arrives) * weight
+        throughput = dr.select(is_null, path.throughput, here.arrives) * weight
         most = dr.max(throughput)
         active = active & (most != 0) & (has_bounces | is_null)
         probability = dr.minimum(most * dr.square(eta), MAX_SURVIVAL_PROBABILITY)
@@ -279,9 +263,7 @@ class _Path:
         """Return the vertex; attached: to the surfaces of this vertex and the last."""
         si = self.hit.compute_surface_interaction(self.ray, ray_flags=mi.RayFlags.All)
         if attached:
-            last = self.last_hit.compute_surface_interaction(
-                self.last_ray, ray_flags=mi.RayFlags.Minimal
-            )
+            last = self.last_hit.compute_surface_interaction(self.last_ray, mi.RayFlags.Minimal)
             here = dr.detach(si)
             moved = here.to_local(dr.normalize(last.p - here.p))
             si.wi = _replace_grad(si.wi, dr.select(self.depth >= 1, moved, si.wi))
@@ -310,6 +292,14 @@ class _Path:
 
 
 @dataclass(frozen=True)
+class _Vertex:
+    scene: mi.Scene
+    path: _Path  # that leads here
+    si: mi.SurfaceInteraction3f
+    arrives: mi.Spectrum  # throughput past the splats before it
+
+
+@dataclass(frozen=True)
 class _Step:
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f
@@ -329,9 +319,7 @@ class _Step:
     def relative_change(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Spectrum:
         """Return 1, attached to the relative change of the light that the vertex reflects."""
         bsdf, is_delta = si.bsdf(ray), self.is_delta
-        next_si = self.hit.compute_surface_interaction(
-            self.ray, ray_flags=mi.RayFlags.Minimal, active=self.active
-        )
+        next_si = self.hit.compute_surface_interaction(self.ray, mi.RayFlags.Minimal, self.active)
         # A moving vertex sees the next one in another solid angle.
         next_si = dr.detach(next_si)
         hits = self.active & next_si.is_valid() & ~is_delta
@@ -371,9 +359,8 @@ def _attach_sample(
     moved.d = dr.select(ds.delta, again.d, moved.d)
     ds = _replace_grad(ds, moved)
     # Samples are points of the emitter: a moving vertex sees them in another solid angle.
-    jacobian = solid_angle_to_area_jacobian(
-        si.p, dr.detach(ds.p), dr.detach(ds.n), active & is_surface
-    )
+    p, n = dr.detach(ds.p), dr.detach(ds.n)
+    jacobian = solid_angle_to_area_jacobian(si.p, p, n, active & is_surface)
     emitted = scene.eval_emitter_direction(si, ds, active)
     density = dr.select(ds.pdf != 0, dr.rcp(dr.detach(ds.pdf)), 0)
     weight = _replace_grad(weight, dr.select(ds.delta, of_lamp, emitted * density))

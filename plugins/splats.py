@@ -163,11 +163,9 @@ class SplatsIntegrator(mi.CppADIntegrator):
             check_object(name, one._given)
             one._is_object = True
         self._is_object = False  # nested in another
-        self.state = read_state(
-            props,
-            {name: one.state.own for name, one in self.objects.items()},
-            [v for k, v in nested.items() if k not in self.objects],
-        )
+        objects = {name: one.state.own for name, one in self.objects.items()}
+        others = [v for k, v in nested.items() if k not in self.objects]
+        self.state = read_state(props, objects, others)
         self.last: BackwardResult | None = None
         self._lock = threading.RLock()  # of the cache and the film
 
@@ -265,12 +263,10 @@ class SplatsIntegrator(mi.CppADIntegrator):
             else:
                 gradients = render.backward(params, grad_in)
                 means2d, frames = gradients.means2d, self.state.cache.kept["frames 0"].value
-                self.last = BackwardResult(
-                    mi.TensorXf(interleave(list(means2d)), (dr.width(means2d), 2)),
-                    gradients.visible,
-                    gradients.first_nonfinite,
-                    [frame for of_time in frames for frame in of_time],
-                )
+                moved = mi.TensorXf(interleave(list(means2d)), (dr.width(means2d), 2))
+                every = [frame for of_time in frames for frame in of_time]
+                visible, first = gradients.visible, gradients.first_nonfinite
+                self.last = BackwardResult(moved, visible, first, every)
                 with dr.resume_grad():
                     self.state.accumulate(scene, gradients.parameters)
 

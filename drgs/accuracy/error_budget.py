@@ -71,11 +71,6 @@ class Level:
         return self.cost_ordered if is_ordered and self.cost_ordered else self.cost
 
 
-def cut_offs(alpha_cut: float, transmittance_stop: float) -> Changes:
-    """Return the values of both cut-offs."""
-    return {"alpha_cut": alpha_cut, "transmittance_stop": transmittance_stop}
-
-
 CENTER = Level({"order": "center"}, 1)
 WINDOWED = tuple(
     Level({"order": "pixel", "order_window": window}, cost)
@@ -85,11 +80,11 @@ WINDOWED = tuple(
 
 DIRECTIONS = (Level({"sh_direction": "mean"}, 1), Level({"sh_direction": "pixel"}, 3, 1.6))
 CUT_OFFS = (
-    Level(cut_offs(1 / 64, 1e-2), 0.87, 0.8),
-    Level(cut_offs(ALPHA_CUT, TRANSMITTANCE_STOP), 1),
-    Level(cut_offs(1 / 2048, 1e-6), 1.25, 1.45),
+    Level({"alpha_cut": 1 / 64, "transmittance_stop": 1e-2}, 0.87, 0.8),
+    Level({"alpha_cut": ALPHA_CUT, "transmittance_stop": TRANSMITTANCE_STOP}, 1),
+    Level({"alpha_cut": 1 / 2048, "transmittance_stop": 1e-6}, 1.25, 1.45),
 )
-FINEST_CUT_OFFS = cut_offs(1e-5, 1e-7)
+FINEST_CUT_OFFS = {"alpha_cut": 1e-5, "transmittance_stop": 1e-7}
 
 
 def projections(cameras: Sequence[Camera]) -> tuple[Level, ...]:
@@ -215,11 +210,6 @@ class MeasuredView:
         end_y, end_x = min(y + _cell_size(height), height), min(x + _cell_size(width), width)
         return MeasuredView(camera, (x, y, end_x - x, end_y - y), float(shares[cell]))
 
-    def cut(self, image: np.ndarray) -> np.ndarray:
-        """Return the window of an image of the view."""
-        x, y, width, height = self.window
-        return image[y : y + height, x : x + width]
-
     def mean_square(self, one: np.ndarray, other: np.ndarray) -> float:
         """Return the mean square difference of the view from images (H, W, 3) of its window."""
         total = float(np.square(one - other, dtype=np.float64).sum())
@@ -260,14 +250,9 @@ def crop(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
     """Return the camera of a window of the film."""
     t = types_of(type(camera.near))
     offset = t.Array2f(dr.opaque(t.Float, x), dr.opaque(t.Float, y))
-    return replace(
-        camera,
-        principal=camera.principal - offset,
-        film_start=camera.film_start - offset,
-        film_end=camera.film_end - offset,
-        width=width,
-        height=height,
-    )
+    places = ("principal", "film_start", "film_end")
+    moved = {name: getattr(camera, name) - offset for name in places}
+    return replace(camera, width=width, height=height, **moved)
 
 
 def bound(errors: Sequence[float] | np.ndarray) -> float:
@@ -366,7 +351,8 @@ class Search:
         if is_whole or self.bound is max or key in images:
             if key not in images:
                 images[key] = self._renderer.image(view.camera, values)
-            return images[key] if is_whole else view.cut(images[key])
+            x, y, width, height = view.window
+            return images[key] if is_whole else images[key][y : y + height, x : x + width]
         key = (*key, view.window)
         if key not in images:
             images[key] = self._renderer.image(view.camera, values, window=view.window)
@@ -374,13 +360,12 @@ class Search:
 
     def _differences(self, changes: Changes, target: Changes, step: int = 1) -> np.ndarray:
         """Return the mean square differences (V,) of views, from those of their windows."""
-        return np.array(
-            [
-                view.mean_square(self._image(k, changes, False), self._image(k, target, False))
-                for k, view in enumerate(self._views)
-                if k % step == 0
-            ]
-        )
+        found = [
+            view.mean_square(self._image(k, changes, False), self._image(k, target, False))
+            for k, view in enumerate(self._views)
+            if k % step == 0
+        ]
+        return np.array(found)
 
     def _squares(self, levels: Sequence[Level], finest: Changes) -> list[LevelSquares]:
         """Return those of levels, of every other view for two unless nothing is estimated."""
@@ -439,15 +424,10 @@ class Search:
         pairs = zip(self.front, errors, strict=True)
         front = [replace(one.choice, error=error) for one, error in pairs]
         chosen = front[place]
-        return BudgetReport(
-            budget,
-            chosen,
-            tuple(of_views),
-            next((one for one in front[place:] if one.error < CLEARLY * chosen.error), None),
-            next((one for one in front[place::-1] if one.cost < CLEARLY * chosen.cost), None),
-            self._best | self._most_samples,
-            math.sqrt(self._unordered.max()),
-        )
+        better = next((one for one in front[place:] if one.error < CLEARLY * chosen.error), None)
+        faster = next((one for one in front[place::-1] if one.cost < CLEARLY * chosen.cost), None)
+        best, uncertainty = self._best | self._most_samples, math.sqrt(self._unordered.max())
+        return BudgetReport(budget, chosen, tuple(of_views), better, faster, best, uncertainty)
 
     def measure(self, place: int) -> np.ndarray:
         """Return the measured square errors (V,) of a choice in the windows; place: in ``front``.

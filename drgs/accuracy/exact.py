@@ -49,13 +49,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 from typing_extensions import override
 
-from drgs.accuracy.peaks import (
-    MAX_EXPONENT,
-    UNBOUNDED_OUTLINE,
-    AffineDepths,
-    bounding_cone,
-    seen_along,
-)
+from drgs.accuracy.peaks import MAX_EXPONENT, OPEN_OUTLINE, AffineDepths, bounding_cone, seen_along
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Pinhole
 from drgs.config.approximations import PROJECTIONS
@@ -181,7 +175,7 @@ class RayFalloff(GaussianFalloff):
         shift = -cone.q / cone.squared
         shift_y = ky / s
         shift_x = (kx - r * shift_y) / p
-        everywhere = [x, y, UNBOUNDED_OUTLINE, 0, UNBOUNDED_OUTLINE]
+        everywhere = [x, y, OPEN_OUTLINE, 0, OPEN_OUTLINE]
         ellipse = [
             x + shift * shift_x,
             y + shift * shift_y,

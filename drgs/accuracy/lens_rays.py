@@ -42,13 +42,7 @@ from functools import reduce
 import drjit as dr
 from typing_extensions import override
 
-from drgs.accuracy.peaks import (
-    MAX_EXPONENT,
-    UNBOUNDED_OUTLINE,
-    AffineDepths,
-    bounding_cone,
-    seen_along,
-)
+from drgs.accuracy.peaks import MAX_EXPONENT, OPEN_OUTLINE, AffineDepths, bounding_cone, seen_along
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import Perspective
 from drgs.core.arrays import types_of
@@ -92,12 +86,9 @@ def lens_shape(
     slopes = lens.true_slopes(camera, position)
     film, kappa, h = seen_along(rows, camera, position, slopes, low_pass)
     depth, place = lens.depth_direction(own, position), film.means2d
-    jacobian = [
-        row + change * depth
-        for row, change in zip(
-            lens.projection_jacobian(own, position, slopes), place - dr.detach(place), strict=True
-        )
-    ]
+    jacobian = lens.projection_jacobian(own, position, slopes)
+    moves = place - dr.detach(place)
+    jacobian = [row + move * depth for row, move in zip(jacobian, moves, strict=True)]
     origin = lens.origin(camera, *place) if lens.parallel else None
     if (reading := camera.reading) is not None:
         jacobian = [reading.turn.T @ row for row in jacobian]
@@ -231,7 +222,7 @@ class LensRayFalloff(GaussianFalloff):
         offsets = [dr.select(bounded, offset, 0) for offset in offsets]
         center, factor, is_ellipse = _ellipse_around(offsets)
         found = [*(place + center), *(dr.sqrt(reach) * factor)]
-        everywhere = [x, y, UNBOUNDED_OUTLINE, 0, UNBOUNDED_OUTLINE]
+        everywhere = [x, y, OPEN_OUTLINE, 0, OPEN_OUTLINE]
         bounded &= is_ellipse
         return [dr.select(bounded, a, b) for a, b in zip(found, everywhere, strict=True)]
 
@@ -258,21 +249,16 @@ class LensRayFalloff(GaussianFalloff):
         del offsets_from
         splat = _SplatRows.unpack(geometry)
         log2_opacity = dr.select(active, self.log2_opacity(geometry), -dr.inf)
-        columns: list[list] = [[] for _ in range(12)]
-        for ray in self.rays:
-            for column, value in zip(columns, splat.peak(ray, log2_opacity), strict=True):
-                column.append(value)
-        u, v, log2_alpha, along, d_e1, d_e2, d_a, d_h, d_o1, d_o2, d_b, origins = columns
+        columns = zip(*(splat.peak(ray, log2_opacity) for ray in self.rays), strict=True)
+        u, v, log2_alpha, along, d_e1, d_e2, d_a, d_h, d_o1, d_o2, d_b, origins = map(list, columns)
         return LensRayFootprint(
             *([], [], u, v, log2_alpha, along, (d_e1, d_e2), d_a, d_h, (d_o1, d_o2), d_b, origins)
         )
 
     def peak(self, geometry: list[Float], x: Float, y: Float) -> tuple[Float, Float]:
         """Return the numerator and the denominator of a peak's depth at a place of the film, px."""
-        a, denominator, *_ = _SplatRows.unpack(geometry).crossing(
-            PixelRay.from_place(self.camera, x, y)
-        )
-        return a, denominator
+        splat = _SplatRows.unpack(geometry)
+        return splat.crossing(PixelRay.from_place(self.camera, x, y))[:2]
 
     @override
     def moments(
@@ -284,28 +270,18 @@ class LensRayFalloff(GaussianFalloff):
         respect to the splat's o'_1, o'_2 and -b.
         """
         assert isinstance(footprint, LensRayFootprint), "made by self.footprint"
-        to_axes = [
-            (footprint.d_e[0], footprint.d_o[0], 1),
-            (footprint.d_e[1], footprint.d_o[1], 1),
-            (footprint.d_a, footprint.d_b, -1),
-        ]
+        (d_e1, d_e2), (d_o1, d_o2) = footprint.d_e, footprint.d_o
+        to_axes = (d_e1, d_o1, 1), (d_e2, d_o2, 1), (footprint.d_a, footprint.d_b, -1)
         sums, of_origins = [positions.sum(weights)], []
+        directions = [[ray.direction[k] for ray in self.rays] for k in range(3)]
         for d_ray, d_origin, sign in to_axes:
-            w = products(weights, d_ray)
-            terms = [
-                [each * ray.direction[k] for each, ray in zip(w, self.rays, strict=True)]
-                for k in range(3)
-            ]
+            terms = [products(products(weights, d_ray), along) for along in directions]
             if has_origins(self.camera):
                 w = products(weights, d_origin)
                 of_origins.append(positions.sum(w))
-                terms = [
-                    [
-                        x + sign * each * o[k]
-                        for x, each, o in zip(terms[k], w, footprint.origins, strict=True)
-                    ]
-                    for k in range(3)
-                ]
+                for k, term in enumerate(terms):
+                    triples = zip(term, w, footprint.origins, strict=True)
+                    terms[k] = [x + sign * each * o[k] for x, each, o in triples]
             sums += [positions.sum(term) for term in terms]
         return [*sums, positions.sum(products(weights, footprint.d_h)), *of_origins]
 
@@ -429,11 +405,9 @@ class _SplatRows:
     def cylinder(self, reach: Float, count: int) -> tuple[list[Array3f], Bool | bool]:
         """Return the same for parallel rays, whose peaks are at 1 + kappa . e times the depth."""
         (kx, ky), size = self.kappa, dr.sqrt(reach)
-        mean, peaks = self._point(type(size)(0), type(size)(0)), []
-        for x, y in _circle(count):
-            u, v = size * x, size * y
-            peaks.append(self._point(u, v) + dr.fma(kx, u, ky * v) * mean)
-        return peaks, True
+        mean = self._point(type(size)(0), type(size)(0))
+        edge = ((size * x, size * y) for x, y in _circle(count))
+        return [self._point(u, v) + dr.fma(kx, u, ky * v) * mean for u, v in edge], True
 
     def _point(self, u: Float, v: Float) -> Array3f:
         """Return the point of the plane n . x = 1 with the coordinates e = (u, v)."""
@@ -503,10 +477,8 @@ def _ellipse_around(points: Sequence[Array2f]) -> tuple[Array2f, Array3f, Bool]:
     columns = [math.sqrt(2 / count) * (point - center) for point in points]
     across, down = [c.x for c in columns], [c.y for c in columns]
     p, r, s = factor_conic(center, across, down, MIN_OUTLINE_VARIANCE).conic_factor
-    radii = [
-        math.sqrt(count / 2) * dr.norm(t.Array2f(dr.fma(p, x, r * y), s * y))
-        for x, y in zip(across, down, strict=True)
-    ]
+    whitened = (t.Array2f(dr.fma(p, x, r * y), s * y) for x, y in zip(across, down, strict=True))
+    radii = [math.sqrt(count / 2) * dr.norm(offset) for offset in whitened]
     least, largest = reduce(dr.minimum, radii), reduce(dr.maximum, radii)
     scale = 1 / (OUTLINE_MARGIN + largest + (largest - least) / 2)
     fits = largest < MAX_OUTLINE_DEVIATION * (least + OUTLINE_MARGIN)

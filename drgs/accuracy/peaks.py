@@ -30,7 +30,7 @@ MAX_ECCENTRICITY = 0.99
 """Outlines of a larger squared eccentricity are treated as unbounded. At the limit, an ellipse is
 ten times as long as wide, and its size accurate to 1e-5 in single precision. It also limits t h."""
 
-UNBOUNDED_OUTLINE = 1e-12  # 1 / px: U of an outline that holds every film
+OPEN_OUTLINE = 1e-12  # 1 / px: U of an outline that holds every film
 
 MAX_EXPONENT = 1e4  # 2^-1e4 is 0 in either precision
 
@@ -145,9 +145,8 @@ class AffineDepths:
 
     def _pixel_depths(self, footprint: MicroTileFootprint, keys: list[Float]) -> list[Float]:
         coordinates = zip(footprint.u, footprint.v, strict=True)
-        return [
-            a / denominator for a, denominator in (self._depth_ratio(keys, *e) for e in coordinates)
-        ]
+        ratios = (self._depth_ratio(keys, *e) for e in coordinates)
+        return [a / denominator for a, denominator in ratios]
 
     @staticmethod
     def _depth_ratio(keys: list[Float], u: Float, v: Float) -> tuple[Float, Float]:

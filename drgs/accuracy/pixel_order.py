@@ -119,9 +119,7 @@ class PixelOrder(CenterOrder):
 
         T, C = _walk(
             inputs,
-            carry=lambda met, pixel: model.features.pixel_values(
-                met.features_at(pixel, model), pixel
-            ),
+            carry=lambda met, k: model.features.pixel_values(met.features_at(k, model), k),
             visit=visit,
             state=(inputs.transmittance(), inputs.zeros(count)),
             nothing=[dr.zeros(t.Float, size)] * count,
@@ -129,15 +127,10 @@ class PixelOrder(CenterOrder):
         dr.eval(T, C)
         columns = [dr.abs(v) for v in T] + [v for plane in C for v in plane]
         last = dr.gather(t.UInt32, bins.tile_start, lanes.tile + 1)
-        return _OrderedTiles(
-            bins=bins,
-            records=records,
-            values=scatter_rows(columns, lanes.micro_tile, size),
-            ends=scatter_rows([last] * PIXELS, lanes.micro_tile, size),
-            stop=scatter_rows([last], lanes.micro_tile, size),
-            count=count,
-            lists=lists,
-        )
+        values = scatter_rows(columns, lanes.micro_tile, size)
+        ends = scatter_rows([last] * PIXELS, lanes.micro_tile, size)
+        stop = scatter_rows([last], lanes.micro_tile, size)
+        return _OrderedTiles(bins, records, values, ends, stop, count, lists)
 
     @override
     def adjoint(
@@ -216,13 +209,6 @@ class PixelLists:
         first = dr.gather(UInt32, self.start, number)
         return first, dr.gather(UInt32, self.start, number + 1)
 
-    def places(self) -> UInt32:
-        """Return the map from an item as made to its place in the lists, (items,)."""
-        UInt32, size = type(self.order), dr.width(self.order)
-        places = dr.empty(UInt32, size)
-        dr.scatter(places, dr.arange(UInt32, size), self.order)
-        return places
-
     @staticmethod
     def build(bins: TileBins, records: Records, depths: AffineDepths) -> PixelLists:
         """Make the lists. The host reads one value, the number of items."""
@@ -244,13 +230,8 @@ class PixelLists:
         order = dr.gather(t.UInt32, by_depth, stable_order(lists, num_lists))
         entries, lists = (dr.gather(t.UInt32, c, order) for c in (entries, micro_tiles))
         dr.eval(entries, lists, order)
-        return PixelLists(
-            entries=entries,
-            order=order,
-            first_item=dr.gather(t.UInt32, first, bins.first_entry),
-            start=lower_bounds(lists, count, num_lists),
-            count=count,
-        )
+        first_item = dr.gather(t.UInt32, first, bins.first_entry)
+        return PixelLists(entries, order, first_item, lower_bounds(lists, count, num_lists), count)
 
 
 _LEVELS = 1 << 14
@@ -448,18 +429,13 @@ def _walk(
 
     size = inputs.size
     empty = [dr.full(t.Float, -dr.inf, size), dr.zeros(t.Float, size), *nothing]
-    _, _, state, _ = dr.while_loop(
-        state=(
-            begin,
-            [[[type(x)(x) for x in empty] for _ in range(order.window)] for _ in range(PIXELS)],
-            state,
-            dr.full(t.Bool, True, size),
-        ),
-        # After the last splat, the window still has to be emptied.
-        cond=lambda place, queue, state, go_on: (place < end + order.window) & go_on,
-        body=body,
-    )
-    return state
+    queue = [[[type(x)(x) for x in empty] for _ in range(order.window)] for _ in range(PIXELS)]
+    # After the last splat, the window still has to be emptied.
+    return dr.while_loop(
+        (begin, queue, state, dr.full(t.Bool, True, size)),
+        lambda place, queue, state, go_on: (place < end + order.window) & go_on,
+        body,
+    )[2]
 
 
 def _insert(places: list[list[Float]], item: list[Float]) -> tuple[list[list[Float]], list[Float]]:
@@ -544,10 +520,7 @@ def _pairs(
 
     result = _walk(
         inputs,
-        carry=lambda met, pixel: [
-            _feature_gradient(inputs, met, pixel, g),
-            first_place + met.place,
-        ],
+        carry=lambda met, k: [_feature_gradient(inputs, met, k, g), first_place + met.place],
         visit=store,
         state=(inputs.transmittance(), *inputs.zeros(2)),
         nothing=[dr.zeros(t.Float, inputs.size), dr.zeros(t.UInt32, inputs.size)],
@@ -587,19 +560,19 @@ def _sum_pixels(inputs: _WalkInputs, pairs: list[Float], g: list[list[Float]]) -
     return partials
 
 
-def _sum_items(
-    inputs: _WalkInputs, partials: Rows, before: SplatGradients | None
-) -> SplatGradients:
-    lists, places = inputs.lists, inputs.lists.places()
-    UInt32 = type(places)
+def _sum_items(inputs: _WalkInputs, rows: Rows, before: SplatGradients | None) -> SplatGradients:
+    lists = inputs.lists
+    UInt32, size = type(lists.order), dr.width(lists.order)
+    places = dr.empty(UInt32, size)  # (items,): item as made -> place in the lists
+    dr.scatter(places, dr.arange(UInt32, size), lists.order)
 
     def totals(rank: UInt32, sample: UInt32) -> list[Float]:
         first_place = sample * dr.opaque(UInt32, lists.count)
 
         def load(item: UInt32) -> list[Float]:
-            return partials.load(first_place + dr.gather(UInt32, places, item))
+            return rows.load(first_place + dr.gather(UInt32, places, item))
 
-        return sum_runs(partials.Float, lists.first_item, rank, load)
+        return sum_runs(rows.Float, lists.first_item, rank, load)
 
     return splat_gradients(inputs.bins, totals, len(inputs.samples), before)
 

@@ -76,9 +76,8 @@ class RayColors(SplatFeatures):
 
     @override
     def pixel_values(self, stored: list[Float], pixel: int) -> list[Float]:
-        colors = [
-            dr.select(value < COLOR_MIN, COLOR_MIN, value) for value in self._sums(stored, pixel)
-        ]
+        sums = self._sums(stored, pixel)
+        colors = [dr.select(value < COLOR_MIN, COLOR_MIN, value) for value in sums]
         return colors + stored[self.num_coefficients :]
 
     def _sums(self, stored: list[Float], pixel: int, start: float = 0.5) -> list[Float]:
@@ -92,18 +91,13 @@ class RayColors(SplatFeatures):
     def add_derivatives(
         self, totals: list[Float], stored: list[Float], pixel: int, weight: Float, g: list[Float]
     ) -> list[Float]:
-        d_colors = [
-            dr.select(value < COLOR_MIN, 0, weight * derivative)
-            for value, derivative in zip(self._sums(stored, pixel), g[:CHANNELS], strict=True)
-        ]
+        pairs = zip(self._sums(stored, pixel), g[:CHANNELS], strict=True)
+        d_colors = [dr.select(value < COLOR_MIN, 0, weight * d) for value, d in pairs]
         coefficients, others = totals[: self.num_coefficients], totals[self.num_coefficients :]
         d_basis = [(basis, d) for basis in self.basis[pixel] for d in d_colors]
-        return [
-            dr.fma(d, basis, total) for total, (basis, d) in zip(coefficients, d_basis, strict=True)
-        ] + [
-            dr.fma(weight, derivative, total)
-            for total, derivative in zip(others, g[CHANNELS:], strict=True)
-        ]
+        pairs = zip(coefficients, d_basis, strict=True)
+        sums = [dr.fma(d, basis, total) for total, (basis, d) in pairs]
+        return sums + super().add_derivatives(others, stored, pixel, weight, g[CHANNELS:])
 
     @override
     def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:

@@ -10,7 +10,7 @@ positive, so that it is a sum of outer products, without cancellation.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import singledispatch
 
 import drjit as dr
@@ -49,16 +49,16 @@ def unscented_shape(
     rows: GaussianRows, camera: Camera, position: Array3f, low_pass: Float | float
 ) -> FilmShape:
     """Return the unscented transform; the limit MIN_RELATIVE_DEPTH is not differentiated."""
-    points = _sigma_points(camera.lens, rows, camera, position)
+    offsets, mean, usable = _sigma_points(camera.lens, rows, camera, position)
     # The mean itself has the offset 0.
     columns = [
         [-math.sqrt(CENTER_WEIGHT) * mu, *(math.sqrt(SIGMA_POINT_WEIGHT) * (o - mu) for o in axis)]
-        for axis, mu in zip(points.offsets, points.mean, strict=True)
+        for axis, mu in zip(offsets, mean, strict=True)
     ]
-    shift = types_of(type(position.z)).Array2f(points.mean)
+    shift = types_of(type(position.z)).Array2f(mean)
     means2d = camera.lens.project_point(camera, position) + shift
     affine = ewa(rows, camera, position, low_pass)
-    return dr.select(points.usable, factor_conic(means2d, columns[0], columns[1], low_pass), affine)
+    return dr.select(usable, factor_conic(means2d, columns[0], columns[1], low_pass), affine)
 
 
 @PROJECTIONS.register("unscented")
@@ -68,19 +68,13 @@ class Unscented(ProjectionModel):
     shape = staticmethod(unscented_shape)
 
 
-@dataclass(frozen=True)
-class _SigmaPoints:
-    """The six points besides the mean, on the film."""
-
-    offsets: list[list[Float]]  # by side of the film: six places, px, from the mean's
-    mean: list[Float]  # by side: the mean of the offsets
-    usable: Bool | bool
+SigmaPoints = tuple[list[list[Float]], list[Float], Bool | bool]
+"""The six points besides the mean, by side of the film: places (px, from the mean's) and their
+mean; and whether they can be used."""
 
 
 @singledispatch
-def _sigma_points(
-    lens: Lens, rows: GaussianRows, camera: Camera, position: Array3f
-) -> _SigmaPoints:
+def _sigma_points(lens: Lens, rows: GaussianRows, camera: Camera, position: Array3f) -> SigmaPoints:
     """Project the sigma points through any lens, as it projects points."""
     center, slopes = lens.project_point(camera, position), lens.true_slopes(camera, position)
     not_nearer = replace(camera, near=MIN_RELATIVE_DEPTH * lens.visibility(camera, position)[2])
@@ -93,21 +87,18 @@ def _sigma_points(
             place = lens.project_point(camera, point)
             for side, offset in zip(offsets, lens.offset(camera, center, place), strict=True):
                 side.append(offset)
-    return _SigmaPoints(offsets, [SIGMA_POINT_WEIGHT * sum(o[1:], o[0]) for o in offsets], usable)
+    return offsets, [SIGMA_POINT_WEIGHT * sum(o[1:], o[0]) for o in offsets], usable
 
 
 @_sigma_points.register
-def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Array3f) -> _SigmaPoints:
+def _(lens: Pinhole, rows: GaussianRows, camera: Camera, position: Array3f) -> SigmaPoints:
     """Project the sigma points through a pinhole, by formulas that do not cancel."""
     slopes = lens.true_slopes(camera, position)
     m0, m1, n = film_axes(rows, camera, position, slopes)
     # No point is too near.
     far_enough = dr.max(dr.abs(n)) <= (1 - MIN_RELATIVE_DEPTH) / SIGMA_POINT_STDS
-    return _SigmaPoints(
-        offsets=[_sigma_offsets(m, n) for m in (m0, m1)],
-        mean=[_mean_offset(m, n) for m in (m0, m1)],
-        usable=_same(slopes, lens.clamped_slopes(camera, position)) & far_enough,
-    )
+    offsets, mean = [_sigma_offsets(m, n) for m in (m0, m1)], [_mean_offset(m, n) for m in (m0, m1)]
+    return offsets, mean, _same(slopes, lens.clamped_slopes(camera, position)) & far_enough
 
 
 def _same(slopes: list[Float] | None, clamped: list[Float] | None) -> Bool | bool:

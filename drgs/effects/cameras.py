@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from pydantic import Field
-from typing_extensions import override
+from typing_extensions import Self, override
 
 from drgs.cameras.motion import rotation_matrix
 from drgs.cameras.viewpoints import OPENCV_TO_MITSUBA
@@ -105,13 +105,9 @@ class LensChange:
 
     def apply(self, view: View) -> View:
         """Return the view with this lens."""
-        return replace(
-            view,
-            fx=view.fx * self.focal[0],
-            fy=view.fy * self.focal[1],
-            cx=view.cx + self.principal[0] * view.width,
-            cy=view.cy + self.principal[1] * view.height,
-        )
+        (wide, tall), (right, down) = self.focal, self.principal
+        cx, cy = view.cx + right * view.width, view.cy + down * view.height
+        return replace(view, fx=view.fx * wide, fy=view.fy * tall, cx=cx, cy=cy)
 
 
 @dataclass(frozen=True)
@@ -146,9 +142,7 @@ class CameraRefinement(OptimisedEffect):
 
     @classmethod
     @override
-    def from_config(
-        cls, config: FitConfig, dataset: Dataset, section: CamerasConfig
-    ) -> CameraRefinement:
+    def from_config(cls, config: FitConfig, dataset: Dataset, section: CamerasConfig) -> Self:
         return cls(section, len(dataset.train), dataset.extent)
 
     @classmethod
@@ -194,12 +188,9 @@ class CameraRefinement(OptimisedEffect):
         if view.motion is not None:
             between = np.linalg.solve(view.camera_to_world, view.motion.close_to_world)
             motion = mi.Matrix4f(between.astype(np.float32))
-        start = _Start(
-            to_world=mi.Matrix4f(view.camera_to_world.astype(np.float32)),
-            motion=motion,
-            intrinsics=mi.Vector4f(*(float(getattr(view, name)) for name in INTRINSICS)),
-            size=mi.Vector2f(view.width, view.height),
-        )
+        to_world = mi.Matrix4f(view.camera_to_world.astype(np.float32))
+        intrinsics = mi.Vector4f(*(float(getattr(view, name)) for name in INTRINSICS))
+        start = _Start(to_world, motion, intrinsics, mi.Vector2f(view.width, view.height))
         dr.make_opaque(start)
         return start
 

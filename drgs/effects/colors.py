@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, cast
 import drjit as dr
 import numpy as np
 from pydantic import Field
-from typing_extensions import override
+from typing_extensions import Self, override
 
 from drgs.config.extensions import EFFECTS
 from drgs.config.section import Rate, Section, Weight
@@ -96,9 +96,7 @@ class ColorCorrection(CenteredEffect):
 
     @classmethod
     @override
-    def from_config(
-        cls, config: FitConfig, dataset: Dataset, section: ColorConfig
-    ) -> ColorCorrection:
+    def from_config(cls, config: FitConfig, dataset: Dataset, section: ColorConfig) -> Self:
         return cls(section, len(dataset.train))
 
     @classmethod
@@ -109,12 +107,10 @@ class ColorCorrection(CenteredEffect):
         exposures = gains.mean(axis=1)
         by_view = trimmed_deviation(exposures - np.median(exposures))
         by_color = float((gains - exposures[:, None]).std())
-        return Finding(
-            "exposure and white balance",
-            f"brightness differs by {by_view:.1%}, colours by {by_color:.1%}",
-            is_likely=by_view > MIN_BRIGHTNESS_DEVIATION or by_color > MIN_COLOR_DEVIATION,
-            changes={"colors.lr": EXAMINED_LR},
-        )
+        evidence = f"brightness differs by {by_view:.1%}, colours by {by_color:.1%}"
+        is_likely = by_view > MIN_BRIGHTNESS_DEVIATION or by_color > MIN_COLOR_DEVIATION
+        changes = {"colors.lr": EXAMINED_LR}
+        return Finding("exposure and white balance", evidence, is_likely, changes)
 
     def __init__(self, config: ColorConfig, num_views: int) -> None:
         """num_views: of the training split."""
@@ -198,7 +194,5 @@ class _TransformColors(dr.CustomOp):
     def _rows(matrix: TensorXf) -> list[list[Float]]:
         """Return the numbers as arrays of one entry, that are not compiled into the kernel."""
         flat = matrix.array
-        UInt32 = types_of(type(flat)).UInt32
-        return [
-            [dr.gather(type(flat), flat, UInt32(4 * i + j)) for j in range(4)] for i in range(3)
-        ]
+        t = types_of(type(flat))
+        return [[dr.gather(t.Float, flat, t.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]

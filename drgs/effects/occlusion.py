@@ -52,11 +52,9 @@ class OccludedFeatures(SplatFeatures):
         fronts = range(end - len(self.surfaces), end)
         return [
             FeatureGroup(
-                stored=[*group.stored, depth],
-                planes=[*group.planes, *fronts],
-                features=replace(self, features=group.features),
+                [*g.stored, depth], [*g.planes, *fronts], replace(self, features=g.features)
             )
-            for group in self.features.groups(num_stored - 1, size)
+            for g in self.features.groups(num_stored - 1, size)
         ]
 
     @override
@@ -79,11 +77,8 @@ class OccludedFeatures(SplatFeatures):
             coverage = load_pixels(surface.coverage, lanes, self.grid)
             rests = [rest - c for rest, c in zip(rests, coverage, strict=True)]
             bound.append(list(zip(depths, rests, strict=True)))
-        return replace(
-            self,
-            features=self.features.bind(lanes, positions),
-            bound=list(zip(*bound, strict=True)),
-        )
+        features = self.features.bind(lanes, positions)
+        return replace(self, features=features, bound=list(zip(*bound, strict=True)))
 
     @override
     def at_depth(self, stored: list[Float], depth: Float) -> list[Float]:
@@ -110,9 +105,8 @@ class OccludedFeatures(SplatFeatures):
     def feature_gradient(self, stored: list[Float], pixel: int, g: list[Float]) -> Float:
         *others, depth = stored
         own, fronts = self._split(g)
-        gradient = self._transmitted_share(depth, pixel) * self.features.feature_gradient(
-            others, pixel, own
-        )
+        seen = self._transmitted_share(depth, pixel)
+        gradient = seen * self.features.feature_gradient(others, pixel, own)
         return gradient + sum(
             dr.select(depth <= z, d_front, 0)
             for (z, _), d_front in zip(self.bound[pixel], fronts, strict=True)

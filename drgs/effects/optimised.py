@@ -119,9 +119,7 @@ class OptimisedEffect(TrainingEffect):
         return result
 
     def _optimizers_of(self, view: TrainingView) -> dict[str, Adam]:
-        return {
-            name: rows[min(view.index, len(rows) - 1)] for name, rows in self.optimizers.items()
-        }
+        return {k: rows[min(view.index, len(rows) - 1)] for k, rows in self.optimizers.items()}
 
 
 class CenteredEffect(OptimisedEffect):

@@ -45,9 +45,7 @@ class Sheared:
         moved_x, moved_y = camera.lens.offset(camera, place, film.means2d)
         moved_y = moved_y / (1 - rate)
         Array2f = type(film.means2d)
-        return replace(
-            film,
-            means2d=place + Array2f(dr.fma(drift, moved_y, moved_x), moved_y),
-            conic_factor=type(film.conic_factor)(p, r, s),
-            variances=Array2f((1 + dr.square(r / s)) / dr.square(p), 1 / dr.square(s)),
-        )
+        means2d = place + Array2f(dr.fma(drift, moved_y, moved_x), moved_y)
+        conic_factor = type(film.conic_factor)(p, r, s)
+        variances = Array2f((1 + dr.square(r / s)) / dr.square(p), 1 / dr.square(s))
+        return replace(film, means2d=means2d, conic_factor=conic_factor, variances=variances)

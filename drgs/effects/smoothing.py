@@ -147,9 +147,8 @@ def bake_smoothing(gaussians: Gaussians) -> Gaussians:
         return g
     variances = np.exp(2 * g.log_scales.astype(np.float64))
     widened = variances + np.square(g.smoothing.astype(np.float64))[:, None]
-    opacities = np.sqrt(np.prod(variances / widened, axis=1)) / (
-        1 + np.exp(-g.logit_opacities.astype(np.float64))
-    )
+    odds = np.exp(-g.logit_opacities.astype(np.float64))
+    opacities = np.sqrt(np.prod(variances / widened, axis=1)) / (1 + odds)
     log_scales = (np.log(widened) / 2).astype(np.float32)
     logits = _finite_logits(opacities)
     return replace(g, log_scales=log_scales, logit_opacities=logits, smoothing=None)

@@ -73,15 +73,9 @@ class ImageRays:
         nested = nested_surfaces(splats, scene, sensor, 0, 1)
         # A single sample would average the coverage of edges over their pixels.
         times = 2 if self.count == 1 and nested is not None else 1
+        positions = times * self.positions
         view = SensorRender(
-            splats=splats,
-            scene=scene,
-            index=NESTED_VIEW,
-            sensor=sensor,
-            positions=times * self.positions,
-            key=self,
-            has_alpha=True,
-            nested=nested,
+            splats, scene, NESTED_VIEW, sensor, positions, key=self, has_alpha=True, nested=nested
         )
         if nested is not None:
             nested = nested.with_surfaces(view.num_surfaces(nested))

@@ -164,19 +164,13 @@ class SceneRenderer:
         left, top = film.crop_offset()
         numbers = map(int, (*film.size(), left + x, top + y, *size))
         part = {"type": "hdrfilm", **dict(zip(FILM_NUMBERS, numbers, strict=True))}
-        view = SensorRender(
-            splats=splats,
-            scene=self.scene,
-            index=cache.find(f"number of {place}", (), (), lambda: len(cache.kept)).value,
-            sensor=sensor,
-            positions=(PixelCenters(),),
-            key=None,
-            has_alpha=False,
-            nested=nested_surfaces(splats, self.scene, sensor, 0, 0),
-            window=mi.load_dict(part),
-        )
-        if view.nested is not None:
-            view = replace(view, nested=view.nested.with_surfaces(view.num_surfaces(view.nested)))
+        index = cache.find(f"number of {place}", (), (), lambda: len(cache.kept)).value
+        nested = nested_surfaces(splats, self.scene, sensor, 0, 0)
+        positions, part = (PixelCenters(),), mi.load_dict(part)
+        # The positions never change, and there is no alpha.
+        view = SensorRender(splats, self.scene, index, sensor, positions, None, False, nested, part)
+        if nested is not None:
+            view = replace(view, nested=nested.with_surfaces(view.num_surfaces(nested)))
         (channels,) = view.channels(view.planes(), constant_background(splats))
         cache.forget("frames")
         color, own = mi.Color3f(channels[:3]), channels[3:]

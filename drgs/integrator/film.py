@@ -102,16 +102,10 @@ def pixels_adjoint(
     """
     matrix = film_map(film, maps, aovs)
     pixel = dr.arange(mi.UInt32, grad_in.shape[0] * grad_in.shape[1])
-    developed = [
-        dr.gather(mi.Float, grad_in.array, pixel * len(matrix) + k) for k in range(len(matrix))
-    ]
-    return [
-        sum(
-            (float(weight) * d for weight, d in zip(column, developed, strict=True) if weight),
-            start=mi.Float(0),
-        )
-        for column in matrix.T
-    ]
+    count = len(matrix)
+    developed = [dr.gather(mi.Float, grad_in.array, pixel * count + k) for k in range(count)]
+    columns = (zip(column, developed, strict=True) for column in matrix.T)
+    return [sum((float(w) * d for w, d in column if w), mi.Float(0)) for column in columns]
 
 
 def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) -> np.ndarray:
@@ -126,8 +120,7 @@ def film_map(film: mi.Film, maps: dict[str, np.ndarray], aovs: Sequence[str]) ->
         planes = [from_host(mi.Float, plane) for plane in channels.T]
         return np.array(develop_pixels(film, planes, aovs)).reshape(num_pixels, -1)
 
-    unit = np.eye(count, dtype=np.float32)
-    units = [develop(np.tile(channel, (num_pixels, 1)))[0] for channel in unit]
+    units = [develop(np.tile(unit, (num_pixels, 1)))[0] for unit in np.eye(count, dtype=np.float32)]
     matrix = np.stack(units, axis=1)
     mixed = np.linspace(0.1, 2, num_pixels * count, dtype=np.float32).reshape(num_pixels, count)
     if not np.allclose(develop(mixed), mixed @ matrix.T, rtol=1e-3, atol=1e-4):
@@ -156,17 +149,15 @@ def split_passes(points: mi.Point2f, count: int, num_pixels: int) -> tuple[Sampl
     return tuple(passes)
 
 
-def split_samples(
-    positions: Sequence[SamplePoints], passes: Sequence[Channels]
-) -> Iterator[Channels]:
+def split_samples(points: Sequence[SamplePoints], passes: Sequence[Channels]) -> Iterator[Channels]:
     """Divide the channels of passes into those of each sample, Float (H * W,)."""
-    for points, channels in zip(positions, passes, strict=True):
-        if points.samples == 1:
+    for point, channels in zip(points, passes, strict=True):
+        if point.samples == 1:
             yield channels
             continue
         dr.eval(channels)
-        num_pixels = dr.width(points.x) // points.samples
-        for sample in range(points.samples):
+        num_pixels = dr.width(point.x) // point.samples
+        for sample in range(point.samples):
             pixel = dr.arange(mi.UInt32, num_pixels) + dr.opaque(mi.UInt32, sample * num_pixels)
             yield [dr.gather(mi.Float, p, pixel, mode=dr.ReduceMode.Permute) for p in channels]
 
@@ -224,10 +215,8 @@ class DrawnSamples(CenterSamples):
             return [[repeat_array(d, point.samples) for d in of_sample] for point in self.points]
         # The image is linear in the channels: their values do not matter.
         num_channels = num_colors(self.film) + len(self.aovs)
-        passes = [
-            [dr.opaque(mi.Float, 0, dr.width(point.x)) for _ in range(num_channels)]
-            for point in self.points
-        ]
+        widths = [dr.width(point.x) for point in self.points]
+        passes = [[dr.opaque(mi.Float, 0, n) for _ in range(num_channels)] for n in widths]
         with dr.resume_grad():
             dr.enable_grad(passes)
             image = self.develop(passes)

@@ -90,16 +90,9 @@ class ImageRender:
             samples = CenterSamples(film, maps, names)
         else:
             samples = DrawnSamples(sensor, seed, spp, maps, names)
-        whole = SensorRender(
-            splats=splats,
-            scene=scene,
-            index=0,
-            sensor=sensor,
-            positions=samples.positions,
-            key=samples.key,
-            has_alpha=mi.has_flag(film.flags(), mi.FilmFlags.Alpha),
-            nested=nested,
-        )
+        positions, key = samples.positions, samples.key
+        has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        whole = SensorRender(splats, scene, 0, sensor, positions, key, has_alpha, nested)
         batch, views = None, [whole]
         if is_batch(sensor):
             batch = SideBySide.from_batch(sensor)
@@ -184,13 +177,11 @@ def nested_surfaces(
     return NestedSurfaces.from_scene(splats, scene, sensor, seed, spp)
 
 
-def check_image(
-    width: int, height: int, spp: int, poses: int, num_aovs: int, nested_spp: int
-) -> None:
+def check_image(width: int, height: int, spp: int, poses: int, aovs: int, nested_spp: int) -> None:
     """Raise PluginError for an image that does not fit into memory.
 
-    width, height: px; spp: of the splats; poses: of the sensor; num_aovs: channels besides colour
-    and alpha; nested_spp: of the nested integrator, 0 for none.
+    width, height: px; spp: of the splats; poses: of the sensor; aovs: channels besides colour and
+    alpha; nested_spp: of the nested integrator, 0 for none.
     """
     if min(width, height) < 1:
         raise PluginError(f"splats: the film must have 1 pixel at least, got {width} x {height}")
@@ -205,7 +196,7 @@ def check_image(
             f"splats: a pixel can have at most {MAX_SAMPLES:,} samples, got {spp:,}{times}; take "
             "the mean of images with other seeds, or, for surfaces alone, set nested_spp"
         )
-    why = too_large_reason(width, height, 3 + num_aovs, spp * poses)
+    why = too_large_reason(width, height, 3 + aovs, spp * poses)
     if why is not None:
         raise PluginError(f"splats: {why}")
     samples, most = width * height * nested_spp, MAX_LANES
@@ -253,10 +244,8 @@ class SensorRender:
         with dr.resume_grad():
             state = self._state()
             is_attached = state.is_attached
-        by_time = [
-            rendering.frames_adjoint(self.splats.gaussians, *of_time, is_attached)
-            for of_time in zip(self.frames, d_planes, strict=True)
-        ]
+        gaussians, times = self.splats.gaussians, zip(self.frames, d_planes, strict=True)
+        by_time = [rendering.frames_adjoint(gaussians, *of_time, is_attached) for of_time in times]
         of_cameras = [gradients.camera for gradients in by_time if gradients.camera]
         if of_cameras:
             with dr.resume_grad():
@@ -266,10 +255,8 @@ class SensorRender:
     def splats_backward(self, d_channels: Passes) -> list[SplatGradients]:
         """Return derivatives with respect to the 2D splats, by time; add the background's."""
         d_planes = self._planes_backward(d_channels)
-        return [
-            rendering.splats_adjoint(*of_time)
-            for of_time in zip(self.frames, d_planes, strict=True)
-        ]
+        times = zip(self.frames, d_planes, strict=True)
+        return [rendering.splats_adjoint(*of_time) for of_time in times]
 
     def _planes_backward(self, d_channels: Passes) -> Planes:
         """Return derivatives with respect to the planes; accumulate the background's."""
@@ -436,21 +423,15 @@ class SensorRender:
     def _traced_surfaces(self, nested: NestedSurfaces) -> Cached[list[list[SurfaceLayers]]]:
         from drgs.integrator.light.visible_surfaces import trace_surfaces
 
-        state = self._camera_state
+        state, with_normals = self._camera_state, "normal" in self.splats.aovs.values()
         hides, (_, far) = self.splats.hide_emitters, depth_range(self.sensor)
-        return self.splats.cache.find(
-            f"surfaces {self.index}",
-            (nested.surfaces, self.key, hides, far, *state.settings),
-            state.device,
-            lambda: trace_surfaces(
-                nested.rays,
-                far,
-                self._film,
-                self._cameras(state),
-                self._offsets,
-                with_normals="normal" in self.splats.aovs.values(),
-            ),
-        )
+        settings = nested.surfaces, self.key, hides, far, *state.settings
+
+        def trace() -> list[list[SurfaceLayers]]:
+            view = self._film, self._cameras(state), self._offsets
+            return trace_surfaces(nested.rays, far, *view, with_normals)
+
+        return self.splats.cache.find(f"surfaces {self.index}", settings, state.device, trace)
 
     def num_surfaces(self, nested: NestedSurfaces) -> int:
         """Return the number of surfaces that are seen one through the other."""
@@ -500,12 +481,8 @@ def _mean(passes: Sequence[Passes]) -> Passes:
     for first in range(0, len(passes), PASSES_PER_KERNEL):
         dr.eval(total)
         terms = [*total, *passes[first : first + PASSES_PER_KERNEL]]
-        total = [
-            [
-                [_sum(values) for values in zip(*of_sample, strict=True)]
-                for of_sample in zip(*terms, strict=True)
-            ]
-        ]
+        by_sample = zip(*terms, strict=True)
+        total = [[[_sum(values) for values in zip(*one, strict=True)] for one in by_sample]]
     return [[value / len(passes) for value in of_sample] for of_sample in total[0]]
 
 

@@ -196,10 +196,8 @@ def entry(flat: Float, index: int) -> Float:
 
 def product(matrix: Float, vector: list[Float], start: int = 0) -> list[Float]:
     """Multiply by a square matrix, flat from ``start`` on."""
-    rows = [
-        [entry(matrix, start + j * len(vector) + k) for k in range(len(vector))]
-        for j in range(len(vector))
-    ]
+    size = len(vector)
+    rows = [[entry(matrix, start + j * size + k) for k in range(size)] for j in range(size)]
     terms = [[a * x for a, x in zip(row, vector, strict=True)] for row in rows]
     return [reduce(operator.add, of_row) for of_row in terms]
 
@@ -213,18 +211,12 @@ class ShRotation:
     @staticmethod
     def from_rotation(rotation: np.ndarray) -> ShRotation:
         """Return the rotation of spherical harmonics; rotation: (3, 3), x' = R x."""
-        return ShRotation._from_matrices(sh_rotation_matrices(rotation, 3))
+        return ShRotation.from_matrices(sh_rotation_matrices(rotation, 3))
 
     @staticmethod
-    def generators() -> list[ShRotation]:
-        """Return derivatives of turned coefficients along rotations about x, y and z."""
-        return [ShRotation._from_matrices(matrices) for matrices in sh_rotation_generators(3)]
-
-    @staticmethod
-    def _from_matrices(matrices: Sequence[np.ndarray]) -> ShRotation:
-        return ShRotation(
-            from_host(mi.Float, np.concatenate([matrix.ravel() for matrix in matrices]))
-        )
+    def from_matrices(matrices: Sequence[np.ndarray]) -> ShRotation:
+        """Return the map by matrices of degree 1, 2 and 3."""
+        return ShRotation(_device(np.concatenate([matrix.ravel() for matrix in matrices])))
 
     def rotate_columns(self, columns: list[Float]) -> list[Float]:
         """Turn columns of the coefficients of degree 1 and above, three a coefficient."""
@@ -304,9 +296,8 @@ class Placement:
         }
         r, (real, *imaginary) = mi.Vector3f(arms["means"]), arms["quats"]
         v = mi.Vector3f(imaginary)
-        about_axes = zip(
-            *(turn.rotate_columns(arms["shN"]) for turn in ShRotation.generators()), strict=True
-        )
+        turns = [ShRotation.from_matrices(each) for each in sh_rotation_generators(3)]
+        about_axes = zip(*(turn.rotate_columns(arms["shN"]) for turn in turns), strict=True)
         changes = {
             "means": list(scale * r + dr.cross(w, r) + shift),
             "quats": [-dr.dot(w, v) / 2, *((w * real + dr.cross(w, v)) / 2)],

@@ -44,11 +44,6 @@ if TYPE_CHECKING:  # imported where the ``to_world`` of shapes is given
     from drgs.integrator.parts import ShRotation
 
 
-def flag(default: bool) -> Declared:
-    """Declare true or false."""
-    return Declared(default)
-
-
 def number(default: float) -> Declared:
     """Declare a number that is finite in single precision."""
     return Declared(float(default), limits=Limits("a finite number", gt=-math.inf, lt=math.inf))
@@ -107,8 +102,8 @@ def refuse_unknown(props: mi.Properties, known: Sequence[str]) -> None:
 
 SETTINGS = {
     "near": positive(NEAR),
-    "hide_emitters": flag(False),
-    "srgb_primitives": flag(True),
+    "hide_emitters": Declared(False),
+    "srgb_primitives": Declared(True),
     "sh_degree": integer(None, 0, 3),
     "nested_spp": integer(0, least=0),
 }
@@ -141,9 +136,7 @@ UNNAMED = "_arg_"  # prefix of Mitsuba's names for nested objects without one
 
 
 def read_state(
-    props: mi.Properties,
-    objects: Mapping[str, SplatObject],
-    nested: Sequence[mi.SamplingIntegrator],
+    props: mi.Properties, objects: Mapping[str, SplatObject], nested: list[mi.SamplingIntegrator]
 ) -> SplatsState:
     """Return the state of ``splats``; objects: nested ``splats``; nested: other integrators."""
     for former, name in FORMER_NAMES.items():
@@ -167,6 +160,7 @@ def read_state(
         given = {name: props[name] for name in DECLARED if name in props}
         approximations = Approximations(**{**header, **given})
     settings = read(props, SETTINGS)
+    ignore, probes, shadows = (_words(props, name) for name in ("ignore", "probes", "shadows"))
     state = SplatsState(
         own=own,
         nested_objects=dict(objects),
@@ -179,12 +173,8 @@ def read_state(
         header=header,
         aovs=_aovs(props, [*AOVS, *feature_widths(every)]),
         given_error=parse_budget(props.get("error")),
-        ignore=_words(props, "ignore"),
-        lighting=LightSettings(
-            **read(props, LIGHT_SETTINGS),
-            probes=_words(props, "probes"),
-            shadows=_words(props, "shadows"),
-        ),
+        ignore=ignore,
+        lighting=LightSettings(**read(props, LIGHT_SETTINGS), probes=probes, shadows=shadows),
         **settings,
     )
     _check_settings(state)
@@ -279,13 +269,11 @@ def _sh_rotations(props: mi.Properties) -> dict[str, ShRotation]:
     from drgs.gaussians.similarity import Similarity
     from drgs.integrator.parts import ShRotation
 
-    sh_rotations = {}
-    for name in names:
-        shape = name.removeprefix(SHAPES_TO_WORLD).removeprefix("_")
-        sh_rotations[shape] = ShRotation.from_rotation(
-            Similarity.from_matrix(matrix(props, name), f"splats: {name}").rotation
-        )
-    return sh_rotations
+    places = {n: Similarity.from_matrix(matrix(props, n), f"splats: {n}") for n in names}
+    return {
+        name.removeprefix(SHAPES_TO_WORLD).removeprefix("_"): ShRotation.from_rotation(one.rotation)
+        for name, one in places.items()
+    }
 
 
 def _background(props: mi.Properties) -> mi.Color3f | mi.Texture:

@@ -68,14 +68,11 @@ def make_sensors(views: Iterable[Viewpoint], calibrated: bool = False) -> list[m
     ``perspective`` where that can represent the camera, else (or with ``calibrated``)
     ``calibrated``. Views of one size share a film.
     """
-    films: dict[tuple[int, int], mi.Film] = {}
-    sensors = []
-    for view in views:
-        size = (view.width, view.height)
-        if size not in films:
-            films[size] = mi.load_dict(film_description(*size))
-        sensors.append(mi.load_dict({**_sensor(view, calibrated), "film": films[size]}))
-    return sensors
+    views = list(views)
+    sizes = dict.fromkeys((view.width, view.height) for view in views)
+    films = {size: mi.load_dict(film_description(*size)) for size in sizes}
+    described = ({**_sensor(v, calibrated), "film": films[v.width, v.height]} for v in views)
+    return [mi.load_dict(sensor) for sensor in described]
 
 
 def film_description(width: int, height: int) -> dict[str, object]:

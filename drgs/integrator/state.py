@@ -328,9 +328,8 @@ class SplatsState:
         cache.has_ellipsoids = bool(shapes)
         with dr.resume_grad():
             is_moved = self.own.is_moved or dr.grad_enabled(self.own.to_world)
-            is_alone = not (
-                shapes or set(self.sh_rotations) - {""} or self.nested_objects or is_moved
-            )
+            others = shapes or set(self.sh_rotations) - {""} or self.nested_objects
+            is_alone = not (others or is_moved)
             parts = [] if is_alone else self.attached_parts(scene)
         if is_alone:
             cache.parts = None
@@ -360,12 +359,10 @@ class SplatsState:
     def _placements(self) -> list[Placement]:
         from drgs.integrator.parts import TO_WORLD, Placement
 
+        named = {f"splats: {k}to_world": one for k, one in self.objects.items()}
         return [
-            Placement(
-                {**self.rendered_part_of(one).arrays, TO_WORLD: one.to_world.matrix},
-                f"splats: {k}to_world",
-            )
-            for k, one in self.objects.items()
+            Placement({**self.rendered_part_of(one).arrays, TO_WORLD: one.to_world.matrix}, name)
+            for name, one in named.items()
         ]
 
     def accumulate(self, scene: mi.Scene, gradients: Gaussians) -> None:
@@ -402,15 +399,9 @@ def check_shapes(gaussians: Gaussians) -> None:
     num = next(iter(gaussians.means.shape), 1)
     if num == 0:
         raise PluginError("splats: at least one Gaussian is needed, got none")
-    rows = {
-        "means": [(3,)],
-        "quats": [(4,)],
-        "log_scales": [(3,)],
-        "logit_opacities": [()],
-        "sh0": [(1, 3)],
-        "shN": [((degree + 1) ** 2 - 1, 3) for degree in range(4)],
-        **({} if gaussians.smoothing is None else {"smoothing": [()]}),
-    }
+    harmonics = {"sh0": [(1, 3)], "shN": [((degree + 1) ** 2 - 1, 3) for degree in range(4)]}
+    rows = {"means": [(3,)], "quats": [(4,)], "log_scales": [(3,)], "logit_opacities": [()]}
+    rows |= harmonics | ({} if gaussians.smoothing is None else {"smoothing": [()]})
     for name, allowed in rows.items():
         got = tuple(getattr(gaussians, name).shape)
         if got not in [(num, *row) for row in allowed]:

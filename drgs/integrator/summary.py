@@ -24,11 +24,8 @@ FILE_HEADER_REASON = "set by the file"  # for effects that the header of the Gau
 def format_effects(effects: Sequence[SimulatedEffect]) -> str:
     """Format the summary: a line for each simulated effect, one for all the others."""
     lines = [f"  {e.name}: {e.what} ({e.why})" for e in effects if e.what is not None]
-    absent = [
-        f"{e.name} (ignored)" if e.ignored else e.name
-        for e in effects
-        if e.what is None or e.ignored
-    ]
+    others = [e for e in effects if e.what is None or e.ignored]
+    absent = [f"{e.name} (ignored)" if e.ignored else e.name for e in others]
     if absent:
         lines.append(f"  not simulated: {', '.join(absent)}")
     return "simulated:\n" + "\n".join(lines)
@@ -66,16 +63,10 @@ def summary_of_sensors(
         effect("depth of field", lambda camera: None if camera.aperture is None else "a thin lens"),
         effect("motion", lambda camera: None if camera.shutter is None else camera.shutter.label),
     ]
-    surfaces = SimulatedEffect(
-        "surfaces",
-        "a nested integrator's image, between the splats" if num_surfaces else None,
-        f"{num_surfaces} of the scene's shapes",
-    )
-    light = SimulatedEffect(
-        "light between splats and surfaces",
-        None if splats.lighting.light == "none" else "along rays of surfaces",
-        "the integrator's light",
-    )
+    image = "a nested integrator's image, between the splats" if num_surfaces else None
+    surfaces = SimulatedEffect("surfaces", image, f"{num_surfaces} of the scene's shapes")
+    rays = None if splats.lighting.light == "none" else "along rays of surfaces"
+    light = SimulatedEffect("light between splats and surfaces", rays, "the integrator's light")
     of_integrator = _summary_of_integrator(splats, environment, of_cameras, splats.header)
     return [*of_integrator, surfaces, *([light] if num_surfaces else [])]
 
@@ -104,14 +95,12 @@ def _summary_of_integrator(
         background = SimulatedEffect("background", "an image", "the integrator's background")
     smooth = splats.gaussians.smoothing is not None
     antialiased = FILE_HEADER_REASON if "antialiased" in from_header else "antialiased"
+    antialiased = antialiased if splats.approximations.antialiased else None
     effects = [
         view_dependence_effect(splats.sh_degree, "the Gaussians' coefficients"),
         background,
         *of_cameras,
-        antialiasing_effect(
-            antialiased if splats.approximations.antialiased else None,
-            "the Gaussians' filter" if smooth else None,
-        ),
+        antialiasing_effect(antialiased, "the Gaussians' filter" if smooth else None),
     ]
     own = [one.gaussians.smoothing for one in splats.objects.values()]
     if not smooth and any(filters is not None for filters in own):

@@ -169,14 +169,11 @@ class _Boxes:
             starts = np.array(lower_bounds(cells, dr.width(rows), num_cells)).astype(np.int64)
         else:
             rows, starts = dr.zeros(t.UInt32, 1), np.zeros(num_cells + 1, np.int64)
-        grid = SplatGrid(
-            t.Array3f(*(dr.opaque(Float, float(c)) for c in self.center)),
-            dr.opaque(Float, float(self.size)),
-            dr.opaque(t.UInt32, levels),
-            dr.opaque(t.UInt32, resolution),
-            from_host(t.UInt32, _cells(starts, levels, resolution)),
-            rows,
-        )
+        center = t.Array3f(*(dr.opaque(Float, float(c)) for c in self.center))
+        size = dr.opaque(Float, float(self.size))
+        num_levels, edge = (dr.opaque(t.UInt32, number) for number in (levels, resolution))
+        lists = from_host(t.UInt32, _cells(starts, levels, resolution))
+        grid = SplatGrid(center, size, num_levels, edge, lists, rows)
         dr.eval(grid)
         return grid
 

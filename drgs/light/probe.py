@@ -24,8 +24,8 @@ from drgs.cameras.camera import Camera
 from drgs.core.arrays import ArrayTypes, types_of
 from drgs.core.types import Array3f, Bool, Float, UInt32
 from drgs.gaussians.parameters import Gaussians
-from drgs.splatting import rendering
 from drgs.splatting.projection import GaussianRows
+from drgs.splatting.rendering import Pipeline, render
 
 CUBE_SIZE_TEXELS = 256  # texels of an edge of the largest cube
 NUM_LEVELS = 7  # cubes of a probe, each with half the edge of the one before
@@ -61,7 +61,7 @@ class Probes:
     @staticmethod
     def render(
         gaussians: Gaussians,
-        pipeline: rendering.Pipeline,
+        pipeline: Pipeline,
         centers: np.ndarray,
         near: float,
         decode: Callable[[Float], Float],
@@ -121,9 +121,8 @@ class Probes:
             return start * (1 - u) + towards * u
 
         active &= dr.dot(dr.gather(t.Array3f, self.normals, probe, active), direction) >= 0
-        u, meets, is_known = self._search(
-            place, end, _Cube.from_level(probe, dr.minimum(level, LAST_DISTANCE_LEVEL)), active
-        )
+        cube = _Cube.from_level(probe, dr.minimum(level, LAST_DISTANCE_LEVEL))
+        u, meets, is_known = self._search(place, end, cube, active)
         is_known &= active
         v, texels = place(u), _Cube.from_level(probe, level).bilinear_texels(place(u))
         colors = [w * dr.gather(t.Array4f, self.colors, texel, is_known) for texel, w in texels]
@@ -172,9 +171,7 @@ class Probes:
         return dr.select(meets, high, end), meets, is_known
 
 
-def _clip_to_plane(
-    t: ArrayTypes, plane: np.ndarray, pipeline: rendering.Pipeline
-) -> rendering.Pipeline:
+def _clip_to_plane(t: ArrayTypes, plane: np.ndarray, pipeline: Pipeline) -> Pipeline:
     """Return a pipeline without the Gaussians whose means are on the other side of a plane."""
     *normal, offset = (dr.opaque(t.Float, float(value)) for value in plane)
 
@@ -266,7 +263,7 @@ def _face(
     center: np.ndarray,
     number: int,
     gaussians: Gaussians,
-    pipeline: rendering.Pipeline,
+    pipeline: Pipeline,
     near: float,
     decode: Callable[[Float], Float],
 ) -> list[Float]:
@@ -277,11 +274,10 @@ def _face(
     forward, right, down = (np.eye(3)[(axis + k) % 3] for k in range(3))
     if is_negative:
         forward, right, down = -forward, down, right
-    K = np.array(
-        [[CUBE_SIZE_TEXELS / 2, 0, edge / 2], [0, CUBE_SIZE_TEXELS / 2, edge / 2], [0, 0, 1]]
-    )
+    focal, middle = CUBE_SIZE_TEXELS / 2, edge / 2
+    K = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
     camera = Camera.create(Float, np.stack([right, down, forward]), center, K, edge, edge, near)
-    T, *color, depth = rendering.render(gaussians, camera, pipeline).planes()
+    T, *color, depth = render(gaussians, camera, pipeline).planes()
     coverage = 1 - T
     shows = coverage > 0
     color = [decode(c / dr.select(shows, coverage, 1)) for c in color]
@@ -329,9 +325,8 @@ def _vector_to(face: UInt32, right: Float, down: Float) -> Array3f:
     right, down = dr.select(is_negative, down, right), dr.select(is_negative, right, down)
     along = dr.select(is_negative, t.Float(-1), 1)
     values = [along, right, down]
-    return t.Array3f(
-        [
-            dr.select(axis == 0, values[k], dr.select(axis == 1, values[k - 1], values[k - 2]))
-            for k in range(3)
-        ]
-    )
+    turned = [
+        dr.select(axis == 0, values[k], dr.select(axis == 1, values[k - 1], values[k - 2]))
+        for k in range(3)
+    ]
+    return t.Array3f(turned)

@@ -17,12 +17,14 @@ Nothing here is differentiated.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
+from typing import Any
 
 import drjit as dr
 
-from drgs.core.arrays import ArrayTypes, Rows, types_of
+from drgs.core.arrays import Rows, types_of
 from drgs.core.constants import COLOR_MIN
 from drgs.core.types import Array3f, Bool, Float, Scalar, UInt32
 from drgs.gaussians.parameters import quat_to_rotation
@@ -103,15 +105,11 @@ class RaySplats:
             return at, last, T, color
 
         size = dr.width(walk.origin)
+        nothing = [dr.full(t.Float, -dr.inf, size), dr.zeros(t.UInt32, size)]
+        black = [dr.zeros(t.Float, size) for _ in range(3)]
+        state = walk.begin(), nothing, dr.select(segment.active, t.Float(1), -1), black
         _, _, T, color = dr.while_loop(
-            state=(
-                _Place.first_of(dr.zeros(t.Float, size)),
-                [dr.full(t.Float, -dr.inf, size), dr.zeros(t.UInt32, size)],
-                dr.select(segment.active, t.Float(1), -1),
-                [dr.zeros(t.Float, size) for _ in range(3)],
-            ),
-            cond=lambda at, last, T, color: (T > 0) & walk.should_continue(at),
-            body=body,
+            state, lambda at, last, T, color: (T > 0) & walk.should_continue(at), body
         )
         return t.Array3f(color), dr.abs(T)
 
@@ -150,28 +148,16 @@ class RaySplats:
                 false_fn=lambda coverage, draws, *_: (coverage, draws),
             )
 
-        def body(at: _Place, coverage: Float, draws: list) -> tuple:
-            return dr.while_loop(
-                state=(walk.find(at), coverage, draws),
-                cond=lambda at, coverage, draws: at.has_entry(),
-                body=choose,
-            )
-
         def should_continue(at: _Place, coverage: Float, draws: list) -> Bool:
             # Later cells are behind the splats drawn in this one.
             more = (at.entry < at.last) | ((_farthest(draws) == dr.inf) & (at.end < walk.stop))
             return segment.active & more
 
         size = dr.width(walk.origin)
-        _, coverage, draws = dr.while_loop(
-            state=(
-                _Place.first_of(dr.zeros(t.Float, size)),
-                dr.zeros(t.Float, size),
-                [_Draw.without_splat(t, size) for _ in range(count)],
-            ),
-            cond=should_continue,
-            body=body,
-        )
+        row, peak = dr.zeros(t.UInt32, size), dr.full(t.Float, dr.inf, size)
+        draws = [_Draw(row, peak, dr.full(t.Bool, False, size)) for _ in range(count)]
+        state = walk.begin(), dr.zeros(t.Float, size), draws
+        _, coverage, draws = walk.read_lists(state, should_continue, choose)
         basis = sh_basis(walk.direction, self.sh_degree)
         found = [self._color(one.row, basis, one.peak < dr.inf) for one in draws]
         # Russian roulette: with the probability A^n, all draws are stopped, and the walk has ended.
@@ -202,21 +188,11 @@ class RaySplats:
             at, _, _, log2_alpha = walk.read_entry(at)
             return at, dr.fma(-walk.alpha(log2_alpha), T, T)
 
-        def body(at: _Place, T: Float) -> tuple:
-            return dr.while_loop(
-                state=(walk.find(at), T),
-                cond=lambda at, T: (least <= T) & at.has_entry(),
-                body=weaken,
-            )
-
-        size = dr.width(walk.origin)
-        _, T = dr.while_loop(
-            state=(
-                _Place.first_of(dr.zeros(t.Float, size)),
-                dr.select(segment.active, t.Float(1), 0),
-            ),
-            cond=lambda at, T: (least <= T) & walk.should_continue(at),
-            body=body,
+        _, T = walk.read_lists(
+            (walk.begin(), dr.select(segment.active, t.Float(1), 0)),
+            lambda at, T: (least <= T) & walk.should_continue(at),
+            weaken,
+            lambda at, T: (least <= T) & at.has_entry(),
         )
         return T
 
@@ -231,12 +207,6 @@ class _Place:
     first: UInt32  # first entry of the list
     last: UInt32  # one past the list's end
     turn: UInt32  # entries since rays of a vector waited for each other
-
-    @staticmethod
-    def first_of(start: Float) -> _Place:
-        """Return the place before the first cell."""
-        UInt32, size = types_of(type(start)).UInt32, dr.width(start)
-        return _Place(start, type(start)(start), *(dr.zeros(UInt32, size) for _ in range(4)))
 
     def has_entry(self) -> Bool:
         """Return whether the list has entries, and other rays need not find another cell first."""
@@ -259,6 +229,30 @@ class _Walk:
         end = dr.select(end < segment.far, end, segment.far)
         origin = segment.origin + segment.direction * dr.select(start < end, start, 0)
         return _Walk(splats, origin, segment.direction, end - start)
+
+    def begin(self) -> _Place:
+        """Return the place before the first cell."""
+        t, size = types_of(type(self.stop)), dr.width(self.origin)
+        start = dr.zeros(t.Float, size)
+        return _Place(start, t.Float(start), *(dr.zeros(t.UInt32, size) for _ in range(4)))
+
+    def read_lists(
+        self,
+        state: tuple,
+        cond: Callable[..., Bool],
+        visit: Callable[..., tuple],
+        reads_on: Callable[..., Bool] = lambda at, *state: at.has_entry(),
+    ) -> tuple:
+        """Visit the entries of lists, cell after cell; return the last state.
+
+        state: a place, and more; cond: whether to go on; visit: maps a state to that after the next
+        entry; reads_on: whether to go on in the list that was found.
+        """
+
+        def body(at: _Place, *others: Any) -> tuple:
+            return dr.while_loop(state=(self.find(at), *others), cond=reads_on, body=visit)
+
+        return dr.while_loop(state=state, cond=cond, body=body)
 
     def should_continue(self, at: _Place) -> Bool:
         """Return whether there is another entry or cell."""
@@ -295,9 +289,8 @@ class _Walk:
         o = Array3f([dr.dot(row, offset) for row in W])
         d = Array3f([dr.dot(row, self.direction) for row in W])
         peak = -dr.dot(o, d) / dr.squared_norm(d)
-        log2_alpha = dr.fma(
-            dr.squared_norm(dr.fma(d, peak, o)), -0.5 * math.log2(math.e), log2_opacity
-        )
+        squared = dr.squared_norm(dr.fma(d, peak, o))
+        log2_alpha = dr.fma(squared, -0.5 * math.log2(math.e), log2_opacity)
         shows = log2_alpha >= self.splats.cutoffs.log2_floor(log2_opacity)
         return peak, dr.select(shows, log2_alpha, -dr.inf)
 
@@ -322,17 +315,9 @@ class _Walk:
             # Equal peaks stay in the order of the list, by Gaussian.
             for place in window:
                 before = item[0] < place[0]
-                pairs = list(zip(place, item, strict=True))
-                kept.append([dr.select(before, new, old) for old, new in pairs])
-                item = [dr.select(before, old, new) for old, new in pairs]
+                kept.append(dr.select(before, item, place))
+                item = dr.select(before, place, item)
             return at, kept, overflows | (item[0] < dr.inf)
-
-        def body(at: _Place, window: list, overflows: Bool) -> tuple:
-            return dr.while_loop(
-                state=(self.find(at), window, overflows),
-                cond=lambda at, window, overflows: at.has_entry(),
-                body=insert,
-            )
 
         def goes_on(at: _Place, window: list, overflows: Bool) -> Bool:
             through = T
@@ -344,15 +329,8 @@ class _Walk:
 
         size, stop = dr.width(at.first), self.splats.cutoffs.transmittance_stop
         empty = [dr.full(t.Float, dr.inf, size), dr.zeros(t.UInt32, size), dr.zeros(t.Float, size)]
-        return dr.while_loop(
-            state=(
-                at,
-                [[type(x)(x) for x in empty] for _ in range(WINDOW_PEAKS)],
-                dr.full(t.Bool, False, size),
-            ),
-            cond=goes_on,
-            body=body,
-        )
+        window = [[type(x)(x) for x in empty] for _ in range(WINDOW_PEAKS)]
+        return self.read_lists((at, window, dr.full(t.Bool, False, size)), goes_on, insert)
 
     def composite(
         self, window: list[list], basis: list[Scalar], T: Float, color: list[Float]
@@ -363,9 +341,8 @@ class _Walk:
         def body(window: list, T: Float, color: list, last: list) -> tuple:
             (peak, row, log2_alpha), *others = window
             active = peak < dr.inf
-            weight, T, _ = composite_step(
-                T, self.alpha(log2_alpha), self.splats.cutoffs.transmittance_stop
-            )
+            stop = self.splats.cutoffs.transmittance_stop
+            weight, T, _ = composite_step(T, self.alpha(log2_alpha), stop)
             seen = self.splats._color(row, basis, active)
             shown = [dr.fma(weight, c, total) for c, total in zip(seen, color, strict=True)]
             gone = [dr.full(t.Float, dr.inf, dr.width(peak)), row, log2_alpha]
@@ -373,12 +350,10 @@ class _Walk:
 
         size = dr.width(T)
         nothing = [dr.full(t.Float, -dr.inf, size), dr.zeros(t.UInt32, size)]
-        _, T, color, last = dr.while_loop(
-            state=(window, T, color, nothing),
-            cond=lambda window, T, color, last: (window[0][0] < dr.inf) & (T > 0),
-            body=body,
-        )
-        return T, color, last
+        state = window, T, color, nothing
+        return dr.while_loop(
+            state, lambda window, T, *others: (window[0][0] < dr.inf) & (T > 0), body
+        )[1:]
 
 
 @dataclass
@@ -394,22 +369,13 @@ class _Draw:
     peak: Float  # inf: no splat
     is_stopped: Bool
 
-    @staticmethod
-    def without_splat(t: ArrayTypes, size: int) -> _Draw:
-        """Return the draw before the first entry of a list."""
-        none = dr.full(t.Float, dr.inf, size)
-        return _Draw(dr.zeros(t.UInt32, size), none, dr.full(t.Bool, False, size))
-
     def offer(self, row: UInt32, peak: Float, chances: _Chances, u: UInt32) -> _Draw:
         """Return the draw after another splat; u: a random number."""
         replaces = u < dr.select(self.is_stopped, 0, chances.replaces)
         competes = u < dr.select(self.is_stopped, chances.stops, chances.competes)
         takes = replaces | (competes & (peak < self.peak))
-        return _Draw(
-            dr.select(takes, row, self.row),
-            dr.select(takes, peak, self.peak),
-            self.is_stopped | (u < chances.stops),
-        )
+        row, peak = dr.select(takes, row, self.row), dr.select(takes, peak, self.peak)
+        return _Draw(row, peak, self.is_stopped | (u < chances.stops))
 
 
 @dataclass(frozen=True)

@@ -286,23 +286,14 @@ def _splats(gaussians: Gaussians, camera: Camera, model: ImageModel) -> _Splats:
     opacities = reference.sigmoid(gaussians.logit_opacities)
     if model.antialiased and model.low_pass > 0:
         opacities = opacities * areas / np.sqrt(dets)
-    extended = affine.scales.max(axis=1) > 0 if model.projection == "exact" else dets > 0
+    extended, whitened = dets > 0, np.zeros((len(z), 3, 3))
     if model.projection == "exact":
+        extended = affine.scales.max(axis=1) > 0
         whitened = _whitened_rays(affine, camera, model.low_pass)
-    else:
-        whitened = np.zeros((len(z), 3, 3))
-    splats = _Splats(
-        depths=z,
-        opacities=opacities,
-        means2d=means2d,
-        cov2d=cov2d,
-        dets=dets,
-        depth_cov=depth_cov,
-        depth_var=np.sum((affine.axes[:, 2] / z[:, None]) ** 2, axis=-1),
-        whitened=whitened,
-        colors=reference.sh_colors(gaussians, camera, degree),
-        sh=gaussians.sh[:, : (degree + 1) ** 2],
-    )
+    depth_var = np.sum((affine.axes[:, 2] / z[:, None]) ** 2, axis=-1)
+    colors = reference.sh_colors(gaussians, camera, degree)
+    sh = gaussians.sh[:, : (degree + 1) ** 2]
+    splats = _Splats(z, opacities, means2d, cov2d, dets, depth_cov, depth_var, whitened, colors, sh)
     return _rows(splats, (opacities > model.alpha_cut) & (extended | (model.low_pass > 0)))
 
 

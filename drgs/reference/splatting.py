@@ -163,11 +163,9 @@ def quat_to_rotation(quats: np.ndarray) -> np.ndarray:
     unit_quats, _ = _normalize(quats, fallback=(1.0, 0.0, 0.0, 0.0))
     w, x, y, z = unit_quats.T
     return _rows_of_matrices(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     )
 
 
@@ -253,7 +251,7 @@ def sh_basis_gradient(directions: np.ndarray, degree: int) -> np.ndarray:
         [2 * C_32 * x * z, -2 * C_32 * y * z, C_32 * (x * x - y * y)],
         [-3 * C_33 * (x * x - y * y), 6 * C_33 * x * y, zero],
     ]
-    return _rows_of_matrices(gradient[: (degree + 1) ** 2])
+    return _rows_of_matrices(*gradient[: (degree + 1) ** 2])
 
 
 def sh_colors(gaussians: Gaussians, camera: Camera, degree: int | None = None) -> np.ndarray:
@@ -321,24 +319,15 @@ def local_affine(gaussians: Gaussians, camera: Camera) -> LocalAffine:
 
     zero = np.zeros_like(z)
     jacobians = _rows_of_matrices(
-        [
-            [camera.fx / z, zero, -camera.fx * ratios[:, 0] / z],
-            [zero, camera.fy / z, -camera.fy * ratios[:, 1] / z],
-        ]
+        [camera.fx / z, zero, -camera.fx * ratios[:, 0] / z],
+        [zero, camera.fy / z, -camera.fy * ratios[:, 1] / z],
     )
     rotations = quat_to_rotation(gaussians.quats)
     scales = np.exp(gaussians.log_scales)
     axes = camera.rotation @ rotations * scales[:, None, :]
+    axes2d, unclamped = jacobians @ axes, ratios == true_ratios
     return LocalAffine(
-        in_front=in_front,
-        means=camera_means,
-        ratios=ratios,
-        unclamped=ratios == true_ratios,
-        jacobians=jacobians,
-        rotations=rotations,
-        scales=scales,
-        axes=axes,
-        axes2d=jacobians @ axes,
+        in_front, camera_means, ratios, unclamped, jacobians, rotations, scales, axes, axes2d
     )
 
 
@@ -355,14 +344,9 @@ def project(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
     opacities = sigmoid(gaussians.logit_opacities)
     if antialiased:
         opacities = opacities * areas / np.sqrt(dets)
-    return Projection(
-        means2d=camera.film_points(affine.means),
-        cov2d=cov2d,
-        conics=_inverses(cov2d, dets),
-        depths=(gaussians.means - camera.center) @ camera.rotation[2],
-        opacities=opacities,
-        visible=affine.in_front & (opacities > ALPHA_CUT),
-    )
+    means2d, visible = camera.film_points(affine.means), affine.in_front & (opacities > ALPHA_CUT)
+    depths = (gaussians.means - camera.center) @ camera.rotation[2]
+    return Projection(means2d, cov2d, _inverses(cov2d, dets), depths, opacities, visible)
 
 
 def widened_covariances(
@@ -388,7 +372,7 @@ def widened_covariances(
 def _inverses(matrices: np.ndarray, dets: np.ndarray) -> np.ndarray:
     """Return the inverses of symmetric matrices (N, 2, 2) whose determinants (N,) are given."""
     a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
-    return _rows_of_matrices([[c / dets, -b / dets], [-b / dets, a / dets]])
+    return _rows_of_matrices([c / dets, -b / dets], [-b / dets, a / dets])
 
 
 # ---- Compositing -----------------------------------------------------------------------------
@@ -698,15 +682,13 @@ def _quat_gradients(quats: np.ndarray, d_rotations: np.ndarray) -> np.ndarray:
     w, x, y, z = unit_quats.T
     zero = np.zeros_like(w)
     derivatives = [
-        _rows_of_matrices([[zero, -z, y], [z, zero, -x], [-y, x, zero]]),
-        _rows_of_matrices([[zero, y, z], [y, -2 * x, -w], [z, w, -2 * x]]),
-        _rows_of_matrices([[-2 * y, x, w], [x, zero, z], [-w, z, -2 * y]]),
-        _rows_of_matrices([[-2 * z, -w, x], [w, -2 * z, y], [x, y, zero]]),
+        _rows_of_matrices([zero, -z, y], [z, zero, -x], [-y, x, zero]),
+        _rows_of_matrices([zero, y, z], [y, -2 * x, -w], [z, w, -2 * x]),
+        _rows_of_matrices([-2 * y, x, w], [x, zero, z], [-w, z, -2 * y]),
+        _rows_of_matrices([-2 * z, -w, x], [w, -2 * z, y], [x, y, zero]),
     ]
-    d_unit_quats = np.stack(
-        [2 * np.einsum("nij,nij->n", derivative, d_rotations) for derivative in derivatives],
-        axis=-1,
-    )
+    d_unit = [2 * np.einsum("nij,nij->n", each, d_rotations) for each in derivatives]
+    d_unit_quats = np.stack(d_unit, axis=-1)
     return _normalize_gradients(unit_quats, norms, d_unit_quats)
 
 
@@ -786,9 +768,9 @@ def _normalize_gradients(units: np.ndarray, norms: np.ndarray, d_units: np.ndarr
     return (d_units - units * along) / norms[:, None]
 
 
-def _rows_of_matrices(entries: list[list[np.ndarray]]) -> np.ndarray:
-    """Return (N, rows, columns) from rows and columns of entries that are (N,) each."""
-    return np.moveaxis(np.array(entries), -1, 0)
+def _rows_of_matrices(*rows: list[np.ndarray]) -> np.ndarray:
+    """Return (N, rows, columns) from rows of entries that are (N,) each."""
+    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def _rows_where(condition: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import ClassVar
 
 import drjit as dr
@@ -385,11 +384,9 @@ class SplatFeatures:
         composited unchanged.
         """
         more, plain = num_stored - self.num_planes(num_stored), SplatFeatures()
-        groups = []
-        for first in range(0, max(num_stored - more, 1), size):
-            planes = list(range(num_stored - more))[first : first + size]
-            stored = [more + plane for plane in planes]
-            groups.append(FeatureGroup(stored, planes, plain))
+        numbers, starts = range(num_stored - more), range(0, max(num_stored - more, 1), size)
+        parts = [list(numbers[first : first + size]) for first in starts]
+        groups = [FeatureGroup([more + plane for plane in part], part, plain) for part in parts]
         groups[0] = FeatureGroup([*range(more), *groups[0].stored], groups[0].planes, self)
         return groups
 
@@ -446,9 +443,7 @@ class SplatFeatures:
         weight: T alpha; g: derivatives of the loss with respect to the pixel's planes.
         """
         del stored, pixel
-        return [
-            dr.fma(weight, derivative, total) for derivative, total in zip(g, totals, strict=True)
-        ]
+        return [dr.fma(weight, d, total) for d, total in zip(g, totals, strict=True)]
 
     def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:
         """Return tangents of the features at a pixel."""
@@ -468,37 +463,30 @@ class ImageModel:
 
     def for_camera(self, camera: Camera) -> ImageModel:
         """Return this model for one camera."""
-        return replace(
-            self,
-            falloff=self.falloff.for_camera(camera),
-            features=self.features.for_camera(camera),
-            period=camera.lens.period(camera),
-        )
+        falloff, features = self.falloff.for_camera(camera), self.features.for_camera(camera)
+        return replace(self, falloff=falloff, features=features, period=camera.lens.period(camera))
 
     def bind(self, lanes: Lanes, grid: TileGrid) -> ImageModel:
         """Return this model for the lanes of one kernel, with inputs loaded before the loop."""
         positions = self.positions.bind(lanes, grid)
-        return replace(
-            self,
-            falloff=self.falloff.bind(lanes, positions),
-            positions=positions,
-            features=self.features.bind(lanes, positions),
-        )
+        falloff = self.falloff.bind(lanes, positions)
+        features = self.features.bind(lanes, positions)
+        return replace(self, falloff=falloff, positions=positions, features=features)
 
     def footprint(
         self, geometry: list[Float], lanes: Lanes, active: Bool | bool
     ) -> MicroTileFootprint:
-        """Evaluate a splat at the pixels of each lane."""
-        return self.falloff.footprint(geometry, partial(self._offsets, lanes), active)
+        """Evaluate a splat at the pixels of each lane; with a period, where it is nearest."""
+
+        def offsets_from(x: Float, y: Float) -> tuple[list[Float], list[Float]]:
+            dx, dy = self.positions.offsets(lanes, x, y)
+            return [shortest(each, self.period) for each in dx], dy
+
+        return self.falloff.footprint(geometry, offsets_from, active)
 
     def nearest(self, x: Float, mean_x: Float) -> Float:
         """Return where a point at x, px, is seen next to a mean at ``mean_x``."""
         return x if self.period is None else mean_x + shortest(x - mean_x, self.period)
-
-    def _offsets(self, lanes: Lanes, x: Float, y: Float) -> tuple[list[Float], list[Float]]:
-        """Return x and y, px, from a mean to the pixels; with a period, the nearest."""
-        dx, dy = self.positions.offsets(lanes, x, y)
-        return [shortest(each, self.period) for each in dx], dy
 
     def alphas(self, geometry: list[Float], footprint: MicroTileFootprint) -> Iterator[Alpha]:
         """Yield alpha at the 16 pixels.

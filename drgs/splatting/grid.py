@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import count
 from typing import TypeVar
 
 import drjit as dr
@@ -39,14 +40,9 @@ class TileGrid:
         return -(-self.width // TILE)
 
     @property
-    def rows(self) -> int:
-        """Tiles in a column."""
-        return -(-self.height // TILE)
-
-    @property
     def num_tiles(self) -> int:
         """Tiles on the film."""
-        return self.columns * self.rows
+        return self.columns * -(-self.height // TILE)
 
     @property
     def num_pixels(self) -> int:
@@ -90,7 +86,8 @@ def make_lanes(
     t = types_of(Float)
     tiles = grid.tiles_of(range(grid.samples)) if tiles is None else tiles
     num_groups = len(tiles) // _GROUP  # the tiles beyond them come last
-    stride = _coprime_stride(max(num_groups, 1))
+    golden = max(1, round(num_groups * (math.sqrt(5) - 1) / 2))
+    stride = next(n for n in count(golden) if math.gcd(n, max(num_groups, 1)) == 1)
     lane = dr.arange(t.UInt32, len(tiles) * MICROS) if order is None else order
     turn, micro = lane // MICROS, lane % MICROS
     group = t.UInt64(turn // _GROUP) * dr.opaque(t.UInt64, stride)
@@ -101,14 +98,9 @@ def make_lanes(
     sample, tile = divide(tile, grid.num_tiles, grid.samples)
     columns = dr.opaque(t.UInt32, grid.columns)
     row = tile // columns
-    return Lanes(
-        micro_tile=micro_tile,
-        micro=micro,
-        tile=tile,
-        sample=sample,
-        x=(tile - row * columns) * TILE + (micro % GRID) * MICRO,
-        y=row * TILE + (micro // GRID) * MICRO,
-    )
+    x = (tile - row * columns) * TILE + (micro % GRID) * MICRO
+    y = row * TILE + (micro // GRID) * MICRO
+    return Lanes(micro_tile, micro, tile, sample, x, y)
 
 
 def group_by_work(Float: type, grid: TileGrid, work: UInt32, tiles: range | None = None) -> Lanes:
@@ -151,30 +143,19 @@ same records, are too far apart; in smaller ones, lengths differ more."""
 _LEVELS = 256
 
 
-def _coprime_stride(count: int) -> int:
-    stride = max(1, round(count * (math.sqrt(5) - 1) / 2))
-    while math.gcd(stride, count) != 1:
-        stride += 1
-    return stride
-
-
 def load_pixels(plane: Float, lanes: Lanes, grid: TileGrid) -> list[Float]:
     """The 16 values of a row-major plane of all samples in each micro-tile; 0 off the film."""
-    return [
-        dr.gather(type(plane), plane, index, inside) for index, inside in pixels_of(lanes, grid)
-    ]
+    pixels = pixels_of(lanes, grid)
+    return [dr.gather(type(plane), plane, index, inside) for index, inside in pixels]
 
 
 def pixels_of(lanes: Lanes, grid: TileGrid) -> list[tuple[UInt32, Bool]]:
     """Return index (in a plane of all samples) and on-film mask of each micro-tile's 16 pixels."""
     UInt32 = type(lanes.x)
     width, height = dr.opaque(UInt32, grid.width), dr.opaque(UInt32, grid.height)
-    first_row, pixels = lanes.sample * height, []
-    for pixel in range(PIXELS):
-        row, column = divmod(pixel, MICRO)
-        x, y = lanes.x + column, lanes.y + row
-        pixels.append(((first_row + y) * width + x, (x < width) & (y < height)))
-    return pixels
+    first_row = lanes.sample * height
+    places = ((lanes.x + k % MICRO, lanes.y + k // MICRO) for k in range(PIXELS))
+    return [((first_row + y) * width + x, (x < width) & (y < height)) for x, y in places]
 
 
 def load_lane_row(values: T, micro_tile: UInt32, planes: int) -> list[T]:

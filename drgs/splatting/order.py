@@ -130,10 +130,8 @@ class InGroups(CenterOrder):
 
     @override
     def composite(self, bins: TileBins, records: Sequence[Records]) -> CompositedGroups:
-        parts = tuple(
-            self.order.composite(_select_group(group, bins), of_group)
-            for group, of_group in zip(_groups(bins), records, strict=True)
-        )
+        pairs = zip(_groups(bins), records, strict=True)
+        parts = tuple(self.order.composite(_select_group(g, bins), each) for g, each in pairs)
         first, count = parts[0], bins.model.features.num_planes(bins.num_features)
         return CompositedGroups(bins, records, first.values, first.ends, first.stop, count, parts)
 

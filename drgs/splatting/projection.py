@@ -179,9 +179,8 @@ def project(
     seen, position, depth = camera.lens.visibility(camera, camera.rotation @ offset)
     low_pass = max(low_pass, MIN_LOW_PASS_PX2)
     film = (shape or ewa)(rows, camera, position, low_pass)
-    opacities = opacity_rule(
-        _sigmoid(rows.logit_opacities), film.determinant, film.added_determinant
-    )
+    opacity = _sigmoid(rows.logit_opacities)
+    opacities = opacity_rule(opacity, film.determinant, film.added_determinant)
     if rows.opacity_compensation is not None:
         opacities = opacities * rows.opacity_compensation
     above_cut = opacities > least_alpha
@@ -242,13 +241,8 @@ def factor_conic(
     determinant, added_determinant = dot(minors, minors), low_pass * (xx / yy + 1)
     p = dr.rsqrt(determinant + added_determinant)
     t = types_of(type(s))
-    return FilmShape(
-        means2d=means2d,
-        conic_factor=t.Array3f(p, -p * (xy / yy), s),
-        variances=t.Array2f(xx + low_pass, yy),
-        determinant=determinant,
-        added_determinant=added_determinant,
-    )
+    conic_factor, variances = t.Array3f(p, -p * (xy / yy), s), t.Array2f(xx + low_pass, yy)
+    return FilmShape(means2d, conic_factor, variances, determinant, added_determinant)
 
 
 def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:

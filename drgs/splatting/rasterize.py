@@ -200,30 +200,23 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
                 ends[pixel] = dr.select(goes_on & active, entry + 1, ends[pixel])
         return cursor, values, ends, signs >= 0
 
+    cursor = entries.begin()
+    ends = dr.alloc_local(t.UInt32, PIXELS, dr.zeros(t.UInt32, size))
     _, values, ends, _ = dr.while_loop(
-        state=(
-            entries.begin(),
-            start,
-            dr.alloc_local(t.UInt32, PIXELS, dr.zeros(t.UInt32, size)),
-            dr.full(t.Bool, True, size),
-        ),
-        cond=lambda cursor, values, ends, unfinished: entries.pending(cursor) & unfinished,
-        body=body,
+        (cursor, start, ends, dr.full(t.Bool, True, size)),
+        lambda cursor, values, ends, unfinished: entries.pending(cursor) & unfinished,
+        body,
     )
     columns = [values[planes * pixel + k] for k in range(planes) for pixel in range(PIXELS)]
     columns[:PIXELS] = [dr.abs(T) for T in columns[:PIXELS]]
     ends = [ends[pixel] for pixel in range(PIXELS)]
     dr.eval(columns, ends)
-    stored = CompositedTiles(
-        bins=bins,
-        records=records,
-        values=scatter_rows(columns, lanes.micro_tile, size),
-        ends=scatter_rows(ends, lanes.micro_tile, size),
-        stop=scatter_rows([reduce(_larger, ends)], lanes.micro_tile, size),
-        count=count,
-    )
-    dr.eval(stored.values, stored.ends, stored.stop)
-    return stored
+    rows = scatter_rows(columns, lanes.micro_tile, size)
+    end_rows = scatter_rows(ends, lanes.micro_tile, size)
+    last = reduce(lambda a, b: dr.select(b > a, b, a), ends)
+    stops = scatter_rows([last], lanes.micro_tile, size)
+    dr.eval(rows, end_rows, stops)
+    return CompositedTiles(bins, records, rows, end_rows, stops, count)
 
 
 def sign_bits(value: Float) -> Int32:
@@ -234,10 +227,6 @@ def sign_bits(value: Float) -> Int32:
 def any_unfinished(transmittances: list[Float]) -> Bool:
     """Return lanes with a transmittance that is not negative."""
     return reduce(and_, map(sign_bits, transmittances)) >= 0
-
-
-def _larger(a: UInt32, b: UInt32) -> UInt32:
-    return dr.select(b > a, b, a)
 
 
 SPARE_ROWS = 64  # behind the slots, for sums of lanes without a splat
@@ -280,7 +269,8 @@ def composite_adjoint(
     bins = tiles.bins
     pairs = CompositedPairs.find(bins, tiles.stop, samples)
     bands = split_bands(bins, pairs)
-    sums = Rows.empty(bins.rows.Float, bins.num_sums, max(pairs.num_rows, 1))
+    num_rows = int(pairs.row[dr.width(pairs.row) - 1])  # waits for the device
+    sums = Rows.empty(bins.rows.Float, bins.num_sums, max(num_rows, 1))
     for band in bands:
         slots = assign_slots(pairs, band)
         partials = _partials(tiles, slots, d_planes)

@@ -71,11 +71,6 @@ class CompositedPairs:
         num_ranks = dr.width(self.first_row) // len(self.samples)
         return sample * dr.opaque(type(rank), num_ranks) + rank
 
-    @property
-    def num_rows(self) -> int:
-        """Number of entries that are seen; waits for the device."""
-        return int(self.row[dr.width(self.row) - 1])
-
 
 @dataclass(frozen=True)
 class Band:
@@ -99,7 +94,9 @@ def split_bands(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
     starts = repeat_array(bins.tile_start, count, dr.width(bins.masks))
     slots = dr.gather(t.UInt32, running, starts - 1, starts > 0)
     dr.eval(starts, slots)
-    starts, slots = (_merge_inner_ends(column, count) for column in (starts, slots))
+    # The starts of all tiles and the last end, from a column with an end for each sample.
+    columns = (np.array(column, np.int64).reshape(count, -1) for column in (starts, slots))
+    starts, slots = (np.append(each[:, :-1], each[-1, -1]) for each in columns)
     count = -(-max(slots[-1], 1) // BAND_SLOTS)
     targets = slots[-1] * np.arange(1, count) / count
     edges = np.unique([0, *np.searchsorted(slots, targets, side="right") - 1, len(slots) - 1])
@@ -108,12 +105,6 @@ def split_bands(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
         Band(range(first + a, first + b), range(starts[a], starts[b]), int(slots[b] - slots[a]))
         for a, b in pairwise(edges.tolist())
     ]
-
-
-def _merge_inner_ends(column: UInt32, count: int) -> np.ndarray:
-    """Return the starts of all tiles and the last end, from ``count`` columns with an end each."""
-    columns = np.array(column, np.int64).reshape(count, -1)
-    return np.append(columns[:, :-1], columns[-1, -1])
 
 
 @dataclass(frozen=True)

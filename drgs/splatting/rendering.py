@@ -60,11 +60,6 @@ def depth_feature(splats: Splats2D, rows: GaussianRows, camera: Camera) -> list[
     return [splats.depths]
 
 
-def load_unchanged(rows: GaussianRows) -> GaussianRows:
-    """Return the Gaussians unchanged."""
-    return rows
-
-
 @dataclass(frozen=True)
 class Pipeline:
     """The stages and approximations of a rendering; see the module's description."""
@@ -72,7 +67,7 @@ class Pipeline:
     sh_degree: int = 3
     opacity_rule: OpacityRule = plain_opacity
     features: tuple[Feature, ...] = (color_features,)
-    rows: Callable[[GaussianRows], GaussianRows] = load_unchanged  # applied before projection
+    rows: Callable[[GaussianRows], GaussianRows] = lambda rows: rows  # applied before projection
     shape: FilmProjection = ewa  # projection of mean and covariance
     color: SplatColor = color_at_mean  # stored numbers of a splat's colour
     low_pass: float = LOW_PASS  # px^2
@@ -86,16 +81,9 @@ class Pipeline:
 
     def project(self, rows: GaussianRows, camera: Camera) -> Splats2D:
         """Project with this pipeline's approximations."""
-        splats = project(
-            self.rows(rows),
-            camera.for_means(rows.means),
-            self.sh_degree,
-            self.opacity_rule,
-            self.shape,
-            self.color,
-            self.low_pass,
-            self.model.cutoffs.least_alpha,
-        )
+        prepared, moved = self.rows(rows), camera.for_means(rows.means)
+        stages = self.sh_degree, self.opacity_rule, self.shape, self.color, self.low_pass
+        splats = project(prepared, moved, *stages, self.model.cutoffs.least_alpha)
         if rows.features:
             numbers = [number for columns in rows.features.values() for number in columns]
             finite = dr.isfinite(dr.detach(sum(numbers[1:], numbers[0])))
@@ -328,15 +316,11 @@ def weighted_sums(frame: Frame, *planes: Float) -> list[Float]:
 def sum_of_gradients(a: GaussianGradients, b: GaussianGradients) -> GaussianGradients:
     """Add the derivatives of a loss that depends on several cameras."""
     sums = {name: v + b.parameters.arrays[name] for name, v in a.parameters.arrays.items()}
-    total = GaussianGradients(
-        parameters=Gaussians.from_arrays(sums),
-        means2d=a.means2d + b.means2d,
-        visible=a.visible | b.visible,
-        first_nonfinite=dr.select(
-            a.first_nonfinite < b.first_nonfinite, a.first_nonfinite, b.first_nonfinite
-        ),
-        # Derivatives of the cameras are separate.
-    )
+    means2d, visible = a.means2d + b.means2d, a.visible | b.visible
+    first, other = a.first_nonfinite, b.first_nonfinite
+    least = dr.select(first < other, first, other)
+    # Derivatives of the cameras are separate.
+    total = GaussianGradients(Gaussians.from_arrays(sums), means2d, visible, least)
     dr.eval(total)
     return total
 
@@ -388,9 +372,7 @@ def frames_tangent(
     return tangents_with_rays(frames, direction, camera_tangents)
 
 
-def _columns_of(
-    d_rows: GaussianRows, gaussians: Gaussians, visible: Bool
-) -> dict[str, list[Float]]:
+def _columns_of(d_rows: GaussianRows, like: Gaussians, visible: Bool) -> dict[str, list[Float]]:
     """Return per-lane derivatives by parameter, column by column.
 
     The gradient of invisible rows is zero, also if their values are not finite; so is that of SH
@@ -398,7 +380,7 @@ def _columns_of(
     """
     t = types_of(type(d_rows.logit_opacities))
     columns = _parameter_columns(d_rows)
-    missing = 3 * gaussians.shN.shape[1] - len(columns["shN"])
+    missing = 3 * like.shN.shape[1] - len(columns["shN"])
     columns["shN"] += [t.Float(0)] * missing if columns["shN"] else []
     columns["smoothing"] = [] if d_rows.smoothing is None else [d_rows.smoothing]
     columns |= d_rows.features or {}

@@ -219,20 +219,16 @@ def _wrap_columns(
 
 
 def _make_entries(
-    first_entry: UInt32,
-    boxes: Rows,
-    rows: Rows,
-    num_entries: int,
-    grid: TileGrid,
-    model: ImageModel,
+    first_entry: UInt32, boxes: Rows, rows: Rows, count: int, grid: TileGrid, model: ImageModel
 ) -> tuple[UInt32, UInt32]:
     """Return the tile of each entry, and two words: see :func:`_pack`.
 
-    Padding entries are in the last tile and touch nothing: a stable sort leaves them at the end.
+    count: of entries. Padding entries are in the last tile and touch nothing: a stable sort leaves
+    them at the end.
     """
     t = types_of(rows.Float)
     # Rank of each entry: write each rank at the start of its run, then a running maximum.
-    padded = -(-max(num_entries, 1) // WORD) * WORD
+    padded = -(-max(count, 1) // WORD) * WORD
     rank = dr.arange(t.UInt32, dr.width(first_entry) - 1)
     start, end = dr.gather(t.UInt32, first_entry, rank), dr.gather(t.UInt32, first_entry, rank + 1)
     starts = dr.zeros(t.UInt32, padded)
@@ -253,7 +249,7 @@ def _make_entries(
     tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
     geometry = rows.load(rank)[: model.falloff.num_geometry]
     mask = _touched_micros(geometry, tile_x, tile_y, grid, model)
-    exists = entry < dr.opaque(t.UInt32, num_entries)
+    exists = entry < dr.opaque(t.UInt32, count)
     tile = dr.select(exists, tile, dr.opaque(t.UInt32, grid.num_tiles - 1))
     entries = interleave(_pack(rank, tile, dr.select(exists, mask, 0)))
     dr.eval(tile, entries)
@@ -368,13 +364,8 @@ def lower_bounds(sorted_tiles: UInt32, num_entries: int, num_tiles: int) -> UInt
         smaller = dr.gather(UInt32, sorted_tiles, middle) < tile
         return dr.select(smaller, middle + 1, first), dr.select(smaller, last, middle)
 
-    first, _ = dr.while_loop(
-        state=(dr.zeros(UInt32, num_tiles + 1), dr.opaque(UInt32, num_entries, num_tiles + 1)),
-        cond=lambda first, last: first < last,
-        body=body,
-        labels=("first", "last"),
-    )
-    return first
+    bounds = dr.zeros(UInt32, num_tiles + 1), dr.opaque(UInt32, num_entries, num_tiles + 1)
+    return dr.while_loop(bounds, lambda first, last: first < last, body, ("first", "last"))[0]
 
 
 @dataclass
@@ -467,12 +458,8 @@ def count_entries(entries: Entries) -> UInt32:
         return group + 1, count + dr.popcnt(entries._open(group).word)
 
     UInt32 = type(entries.first)
-    _, count = dr.while_loop(
-        state=(UInt32(entries.first), dr.zeros(UInt32, dr.width(entries.first))),
-        cond=lambda group, count: group <= entries.last,
-        body=body,
-    )
-    return count
+    state = UInt32(entries.first), dr.zeros(UInt32, dr.width(entries.first))
+    return dr.while_loop(state, lambda group, count: group <= entries.last, body)[1]
 
 
 def find_lowest_bit(word: UInt32) -> UInt32:

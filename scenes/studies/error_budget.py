@@ -41,7 +41,7 @@ BUDGETS = (0.01, 0.005, 0.003, 0.002)
 NUM_VIEWS = 46
 ORACLE_VIEWS = 4  # of those judged, on which all combinations are rendered
 TRUTH = {"order": "pixel", "order_window": 64, "sh_direction": "pixel"}
-TRUTH |= budgets.cut_offs(1e-6, 1e-8)
+TRUTH |= {"alpha_cut": 1e-6, "transmittance_stop": 1e-8}
 UP = (0.0, 0.0, 1.0)
 
 

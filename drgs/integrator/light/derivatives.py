@@ -58,10 +58,6 @@ class Parameter:
         """Its material and those around it, from the inside out."""
         return [owner for owner in self.owners if isinstance(owner, mi.BSDF)]
 
-    def name_in(self, bsdf: mi.BSDF) -> str:
-        """Return the material's name of the parameter or of its texture."""
-        return self.name.split(".")[-1 - self.owners.index(bsdf)]
-
 
 def check_derivatives(
     splats: SplatsState, scene: mi.Scene, sensor: mi.Sensor, mode: dr.ADMode
@@ -166,7 +162,8 @@ def _geometry_refusal(shape: mi.Shape, kind: str) -> str | None:
 
 def _bsdf_refusal(parameter: Parameter, kind: str) -> str | None:
     bsdf, outer = parameter.bsdfs[0], parameter.bsdfs[-1]
-    name, own = bsdf.class_name(), parameter.name_in(bsdf)
+    name = bsdf.class_name()
+    own = parameter.name.split(".")[-1 - parameter.owners.index(bsdf)]  # or its texture's
     if own in COVERAGE.get(name, ()):
         return "how much of a pixel its surface covers is not; optimise reflectances"
     if own in WRONG_IN_MITSUBA.get(name, ()):

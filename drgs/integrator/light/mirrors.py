@@ -29,7 +29,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.light.rays import PathSegment, StraightRays, has_transparent_parts
 from drgs.integrator.sensors import SensorState, camera_from_sensor
 from drgs.light.probe import LOW_PASS, ProbeHit, bilinear_texels
-from drgs.splatting import rendering
+from drgs.splatting.rendering import Pipeline, render
 
 TEXELS_PER_PIXEL = 2  # texels per pixel of a small film, along either axis
 
@@ -56,23 +56,13 @@ class Plane:
         """Return the signed distance of a point."""
         return dr.dot(self.normal, point) - self.offset
 
-    def gather(self, mirror: mi.UInt32, active: mi.Bool | bool = True) -> Plane:
-        """Gather the planes of some of the mirrors."""
-        normal = dr.gather(mi.Vector3f, self.normal, mirror, active)
-        return Plane(normal, dr.gather(mi.Float, self.offset, mirror, active))
-
     def mirror(self, camera: Camera) -> Camera:
         """Mirror a camera, whose axes then have the other handedness."""
         n = self.normal
-        turned = [
-            list(axis - 2 * dr.dot(axis, n) * n) for axis in map(mi.Vector3f, camera.rotation)
-        ]
-        center = mi.Vector3f(camera.center)
-        return replace(
-            camera,
-            rotation=type(camera.rotation)(turned),
-            center=type(camera.center)(center - 2 * self.height(center) * n),
-        )
+        axes, center = map(mi.Vector3f, camera.rotation), mi.Vector3f(camera.center)
+        rotation = type(camera.rotation)([list(axis - 2 * dr.dot(axis, n) * n) for axis in axes])
+        center = type(camera.center)(center - 2 * self.height(center) * n)
+        return replace(camera, rotation=rotation, center=center)
 
 
 @dataclass(frozen=True)
@@ -126,10 +116,8 @@ def _plane_through(points: np.ndarray) -> tuple[list[float], float] | None:
     middle = points.mean(0)
     offsets = points - middle
     extents, axes = np.linalg.eigh(offsets.T @ offsets)  # from the least on
-    slack = (
-        MAX_RELATIVE_DEPARTURE * np.abs(offsets).max()
-        + MAX_ROUNDING_DEPARTURE * np.abs(points).max()
-    )
+    slack = MAX_RELATIVE_DEPARTURE * np.abs(offsets).max()
+    slack += MAX_ROUNDING_DEPARTURE * np.abs(points).max()
     if extents[1] <= 1e-10 * extents[2] or np.abs(offsets @ axes[:, 0]).max() > slack:
         return None
     return axes[:, 0].tolist(), float(axes[:, 0] @ middle)
@@ -163,7 +151,9 @@ class Mirrors:
         for camera in cameras:
             pipeline = _pipeline(approximations, sh_degree, camera.lens)
             images = [
-                _render_mirror(camera, every.gather(mi.UInt32(k)), scene, gaussians, pipeline)
+                _render_mirror(
+                    camera, dr.gather(Plane, every, mi.UInt32(k)), scene, gaussians, pipeline
+                )
                 for k in range(len(mirrors))
             ]
             colors, ends = (dr.concat(parts) for parts in zip(*images, strict=True))
@@ -174,7 +164,7 @@ class Mirrors:
 
     def look(self, mirror: mi.UInt32, segment: PathSegment, active: mi.Bool) -> ProbeHit:
         """Look up the splats along segments that leave a mirror; mirror: its number."""
-        plane, ray = self.planes.gather(mirror, active), segment.ray
+        plane, ray = dr.gather(Plane, self.planes, mirror, active), segment.ray
         origin = ray.o - 2 * plane.height(ray.o) * plane.normal
         direction = ray.d - 2 * dr.dot(plane.normal, ray.d) * plane.normal
         color, coverage, is_known = mi.Color3f(0), mi.Float(0), mi.Bool(False)
@@ -238,7 +228,7 @@ def _is_same(distance: mi.Float, far: mi.Float, end: mi.Float) -> mi.Bool:
     return dr.select((far < dr.inf) & (end < dr.inf), is_near, (far < dr.inf) == (end < dr.inf))
 
 
-def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> rendering.Pipeline:
+def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> Pipeline:
     """Build the pipeline that renders Gaussians as rays meet them, as far as a lens allows."""
     projection = "exact"
     if not isinstance(lens, Pinhole):
@@ -249,10 +239,8 @@ def _pipeline(approximations: Approximations, sh_degree: int, lens: Lens) -> ren
 
 def _enlarge(camera: Camera, scale: float) -> Camera:
     factor = dr.opaque(mi.Float, scale)
-    changes = {
-        name: factor * getattr(camera, name) + BORDER_TEXELS
-        for name in ("principal", "film_start", "film_end")
-    }
+    places = ("principal", "film_start", "film_end")
+    changes = {name: factor * getattr(camera, name) + BORDER_TEXELS for name in places}
     camera = replace(
         camera,
         focal=factor * camera.focal,
@@ -265,11 +253,7 @@ def _enlarge(camera: Camera, scale: float) -> Camera:
 
 
 def _render_mirror(
-    camera: Camera,
-    plane: Plane,
-    scene: mi.Scene,
-    gaussians: Gaussians,
-    pipeline: rendering.Pipeline,
+    camera: Camera, plane: Plane, scene: mi.Scene, gaussians: Gaussians, pipeline: Pipeline
 ) -> tuple[mi.Float, mi.Float]:
     """Render the splats that the camera sees in a mirror: see :class:`_View`."""
     side = dr.sign(plane.height(mi.Vector3f(camera.center)))
@@ -281,7 +265,7 @@ def _render_mirror(
     assert isinstance(pipeline.order, PixelOrder), "see _pipeline"
     depths = replace(pipeline.order.depths, bounds=(nearest, farthest))
     order = replace(pipeline.order, depths=depths)
-    T, *color = rendering.render(gaussians, camera, replace(pipeline, order=order)).planes()
+    T, *color = render(gaussians, camera, replace(pipeline, order=order)).planes()
     coverage = 1 - T
     color = mi.Color3f(color) / dr.select(coverage > 0, coverage, 1)
     color = coverage * mi.math.srgb_to_linear(color)

@@ -8,7 +8,6 @@ makes any nested integrator render the light that these let through.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Protocol, TypeVar, runtime_checkable
@@ -45,20 +44,18 @@ class StraightRays:
         self, ray: mi.Ray3f, active: mi.Bool
     ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f, mi.Float]:
         """Return the ray past invisible surfaces, its hit, and the hit's opacity (0 for no hit)."""
-        hit, opacity = self._meet(ray, active)
+        hit, opacity = self._hit(ray, active)
         if not self.sees_through:
             return ray, hit, opacity
 
-        def pass_surface(
-            ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, opacity: mi.Float
-        ) -> tuple:
+        def step(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, opacity: mi.Float) -> tuple:
             ray = self.continue_rays(ray, hit, mi.Bool(True))
-            return ray, *self._meet(ray, mi.Bool(True))
+            return ray, *self._hit(ray, mi.Bool(True))
 
         return dr.while_loop(
-            state=(mi.Ray3f(ray), hit, opacity),
-            cond=lambda ray, hit, opacity: hit.is_valid() & (opacity <= MAX_INVISIBLE_OPACITY),
-            body=pass_surface,
+            (mi.Ray3f(ray), hit, opacity),
+            lambda ray, hit, opacity: hit.is_valid() & (opacity <= MAX_INVISIBLE_OPACITY),
+            step,
         )
 
     def continue_rays(
@@ -77,21 +74,16 @@ class StraightRays:
             return dr.select(active & self.scene.ray_test(ray, active), 0, mi.Float(1))
 
         def pass_surface(ray: mi.Ray3f, T: mi.Float, active: mi.Bool) -> tuple:
-            hit, opacity = self._meet(ray, active)
+            hit, opacity = self._hit(ray, active)
             T = T * (1 - opacity)
             active = active & hit.is_valid() & (T > MAX_INVISIBLE_OPACITY)
             return self.continue_rays(ray, hit, active), T, active
 
-        _, T, _ = dr.while_loop(
-            state=(mi.Ray3f(ray), dr.full(mi.Float, 1, dr.width(ray)), mi.Bool(active)),
-            cond=lambda ray, T, active: active,
-            body=pass_surface,
-        )
+        state = mi.Ray3f(ray), dr.full(mi.Float, 1, dr.width(ray)), mi.Bool(active)
+        _, T, _ = dr.while_loop(state, lambda ray, T, active: active, pass_surface)
         return dr.select(T > MAX_INVISIBLE_OPACITY, T, 0)
 
-    def _meet(
-        self, ray: mi.Ray3f, active: mi.Bool
-    ) -> tuple[mi.PreliminaryIntersection3f, mi.Float]:
+    def _hit(self, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.PreliminaryIntersection3f, mi.Float]:
         """Return the first hit and its opacity, 0 where nothing is hit."""
         hit = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         if not self.sees_through:
@@ -127,7 +119,7 @@ class RaysBehind:
             return ray, dr.select(weight > MAX_INVISIBLE_OPACITY, weight, 0)
 
 
-def sensor_behind(sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysBehind) -> mi.Sensor:
+def sensor_behind(sensor: mi.Sensor, sensors: list[mi.Sensor], behind: RaysBehind) -> mi.Sensor:
     """Return a sensor whose rays start behind surfaces; sensors: the children of a ``batch``."""
     return _sensor_type(mi.variant())(sensor, sensors, behind)
 
@@ -139,9 +131,7 @@ def _sensor_type(variant: str) -> type:
     class SensorBehind(mi.Sensor):
         """Rays of another sensor, from behind the first surfaces on."""
 
-        def __init__(
-            self, sensor: mi.Sensor, sensors: Sequence[mi.Sensor], behind: RaysBehind
-        ) -> None:
+        def __init__(self, sensor: mi.Sensor, sensors: list[mi.Sensor], behind: RaysBehind) -> None:
             props = mi.Properties("behind")
             props["film"], props["sampler"] = sensor.film(), sensor.sampler()
             props["shutter_open"] = sensor.shutter_open()

@@ -45,9 +45,8 @@ def shade(splats: SplatsState, scene: mi.Scene) -> None:
         shapes = [node for node in surfaces.objects if isinstance(node, mi.Shape)]
         check_ids("shadows must be ids of the scene's shapes", splats.lighting.shadows, shapes)
         rays = _rays_through(surfaces.objects)
-        without = _rays_through(
-            [o for o in surfaces.objects if o.id() not in splats.lighting.shadows]
-        )
+        others = [o for o in surfaces.objects if o.id() not in splats.lighting.shadows]
+        without = _rays_through(others)
         blocked_by = ray_splats_of(gaussians, splats.approximations, degree=0)
         return _darken(gaussians, _Estimate(rays, without, blocked_by).ratios(gaussians))
 
@@ -90,15 +89,13 @@ class _Estimate:
         normals: mi.Vector3f,
         let_through: Callable[[mi.Ray3f, mi.Float], mi.Float],
     ) -> tuple[mi.Color3f, mi.Color3f]:
-        sampler = mi.load_dict({"type": "independent"})
+        scene, sampler = self.scene.scene, mi.load_dict({"type": "independent"})
         sampler.seed(0, dr.width(points))
         place = dr.zeros(mi.SurfaceInteraction3f, dr.width(points))
         place.p = points
 
         def body(k: mi.UInt32, lit: mi.Color3f, dark: mi.Color3f, sampler: mi.Sampler) -> tuple:
-            ds, weight = self.scene.scene.sample_emitter_direction(
-                place, sampler.next_2d(), False, True
-            )
+            ds, weight = scene.sample_emitter_direction(place, sampler.next_2d(), False, True)
             cosine = dr.dot(normals, ds.d)  # the normal is as long as the splat is thick
             start = points + SHADOW_OFFSET_STDS * dr.sign(cosine) * normals
             ray = mi.Ray3f(mi.Ray3f(start, ds.d), ds.dist * (1 - mi.math.ShadowEpsilon))
@@ -111,11 +108,8 @@ class _Estimate:
             return k + 1, lit, dark, sampler
 
         zero = dr.zeros(mi.Color3f, dr.width(points))
-        _, lit, dark, _ = dr.while_loop(
-            state=(mi.UInt32(0), zero, mi.Color3f(zero), sampler),
-            cond=lambda k, lit, dark, sampler: k < EMITTER_SAMPLES,
-            body=body,
-        )
+        state = mi.UInt32(0), zero, mi.Color3f(zero), sampler
+        _, lit, dark, _ = dr.while_loop(state, lambda k, *others: k < EMITTER_SAMPLES, body)
         dr.eval(lit, dark)
         return lit, dark
 

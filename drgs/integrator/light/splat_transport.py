@@ -103,10 +103,8 @@ class RayTransport(SplatTransport):
     ) -> tuple[mi.Color3f, mi.Float]:
         seed, n = reinterpret(mi.UInt32, sample), max(self.num_samples, MIN_DRAWN_SPLATS)
         drawn, exist, T = self.splats.sample_splats(segment, seed, n)
-        colors = [
-            dr.select(is_open & ~exists, 0, mi.Color3f(color))
-            for color, exists in zip(drawn, exist, strict=True)
-        ]
+        pairs = zip(drawn, exist, strict=True)
+        colors = [dr.select(is_open & ~exists, 0, mi.Color3f(color)) for color, exists in pairs]
         s1, s2, s3 = (sum((color**k for color in colors), mi.Color3f(0)) for k in (1, 2, 3))
         mean = s1 / n
         square = (s1 * s1 - s2) / (n * (n - 1))
@@ -202,7 +200,10 @@ class ProbeTransport(SplatTransport):
             unknown = is_asked & ~seen.is_known
             radiance, T = self.fallback.composite_segment(segment, sample, unknown)
         color = mi.Color3f(seen.color)
-        color = dr.select(segment.is_open, _over_black(color, seen.coverage), color)
+        # Before black as the last splat: D(C), given A D(C / A) and A.
+        display = mi.math.linear_to_srgb(color / dr.select(seen.coverage > 0, seen.coverage, 1))
+        over_black = mi.math.srgb_to_linear(seen.coverage * display)
+        color = dr.select(segment.is_open, over_black, color)
         radiance = dr.select(is_known, self.radiance_scale * color, radiance)
         # An emitter's probe has transmittances of its light, but no view of splats from elsewhere.
         radiance = dr.select(is_reversed, 0, radiance)
@@ -233,11 +234,9 @@ class ProbeTransport(SplatTransport):
             dr.select(is_reversed, 0, self._level(segment.pdf)),
             is_asked & ~mirrored.is_known,
         )
-        seen = ProbeHit(
-            dr.select(mirrored.is_known, mirrored.color, seen.color),
-            dr.select(mirrored.is_known, mirrored.coverage, seen.coverage),
-            seen.is_known | mirrored.is_known,
-        )
+        color = dr.select(mirrored.is_known, mirrored.color, seen.color)
+        coverage = dr.select(mirrored.is_known, mirrored.coverage, seen.coverage)
+        seen = ProbeHit(color, coverage, seen.is_known | mirrored.is_known)
         return seen, is_asked, is_reversed
 
     def _look_in_mirrors(self, probe: mi.UInt32, segment: PathSegment, active: mi.Bool) -> ProbeHit:
@@ -271,9 +270,8 @@ def _probes(
             from drgs.effects.smoothing import apply_smoothing
 
             pipeline = replace(pipeline, rows=apply_smoothing)
-        probes = Probes.render(
-            gaussians, pipeline, centers, splats.near, mi.math.srgb_to_linear, planes
-        )
+        linear = mi.math.srgb_to_linear
+        probes = Probes.render(gaussians, pipeline, centers, splats.near, linear, planes)
         _warn_of_close(splats, objects, flat, probes)
         return probes
 
@@ -378,9 +376,3 @@ def _center(node: mi.Emitter | mi.Shape) -> list[float]:
             f"{node.id()!r}, which is infinitely far away"
         )
     return np.array(box.center(), np.float64).ravel().tolist()
-
-
-def _over_black(color: mi.Color3f, coverage: mi.Float) -> mi.Color3f:
-    """Decode with black as the last splat: return D(C), given A D(C / A) and A."""
-    display = mi.math.linear_to_srgb(color / dr.select(coverage > 0, coverage, 1))
-    return mi.math.srgb_to_linear(coverage * display)

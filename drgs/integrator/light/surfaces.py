@@ -238,9 +238,8 @@ class SurfaceCompositor:
 def _apply_map(matrix: np.ndarray, planes: list[mi.Float]) -> list[mi.Float]:
     if not planes or np.array_equal(matrix, np.eye(3)):
         return planes
-    return [
-        sum((float(m) * p for m, p in zip(row, planes, strict=True)), mi.Float(0)) for row in matrix
-    ]
+    rows = (zip(row, planes, strict=True) for row in matrix)
+    return [sum((float(m) * p for m, p in row), mi.Float(0)) for row in rows]
 
 
 @dataclass(frozen=True)
@@ -279,13 +278,10 @@ class NestedSurfaces:
                 num_paths = count or sensor.sampler().sample_count()
                 transport = transport_of(splats, scene, num_paths, sensors_of(sensor))
             nested.use_transport(transport)
-        compositor = SurfaceCompositor(
-            sensor.film(),
-            cache.film_maps,
-            splats.aov_names(),
-            shows_background=not hide_emitters and scene.environment() is not None,
-            display_space=not splats.srgb_primitives,
-        )
+        shows_background = not hide_emitters and scene.environment() is not None
+        film, maps, names = sensor.film(), cache.film_maps, splats.aov_names()
+        display_space = not splats.srgb_primitives
+        compositor = SurfaceCompositor(film, maps, names, shows_background, display_space)
         traced = surfaces.scene_to_trace(scene)
         rays = StraightRays(traced, hide_emitters, hide_emitters or surfaces.is_transparent)
         return NestedSurfaces(surfaces, nested, adjoint, sensor, seed, count, compositor, rays)
@@ -367,16 +363,20 @@ class NestedSurfaces:
 
         Paths from behind windows have fewer bounces where ``max_depth`` can be set in Python.
         """
+        sampler = self.sensor.sampler()
+        sample_count = sampler.sample_count()
         for count in range(self.compositor.num_surfaces):
             sensor = self.sensor
             if self.surfaces.is_transparent:
                 sensor = sensor_behind(sensor, sensors_of(sensor), RaysBehind(self.rays, count))
             with (
-                _keep_sample_count(self.sensor),
                 _reduce_depth(self.integrator, count),
                 _reduce_depth(self.adjoint_integrator, count),
             ):
-                yield sensor
+                try:
+                    yield sensor
+                finally:  # the nested integrator sets its own
+                    sampler.set_sample_count(sample_count)
 
     @contextmanager
     def _differentiating(self) -> Iterator[list[Parameter]]:
@@ -406,14 +406,3 @@ def _reduce_depth(integrator: Any, count: int) -> Iterator[None]:
         yield
     finally:
         integrator.max_depth = depth
-
-
-@contextmanager
-def _keep_sample_count(sensor: mi.Sensor) -> Iterator[None]:
-    """Restore the sampler's sample count, which the nested integrator sets to its own."""
-    sampler = sensor.sampler()
-    count = sampler.sample_count()
-    try:
-        yield
-    finally:
-        sampler.set_sample_count(count)

@@ -133,10 +133,8 @@ class _Tracer:
         direction = dr.normalize(direction)
         start, end = camera.lens.ray_range(direction, camera.near, self.far)
         to_world = camera.rotation.T
-        ray = mi.Ray3f(
-            o=mi.Point3f(camera.center + to_world @ (origin + start * direction)),
-            d=mi.Vector3f(to_world @ direction),
-        )
+        first = mi.Point3f(camera.center + to_world @ (origin + start * direction))
+        ray = mi.Ray3f(first, mi.Vector3f(to_world @ direction))
         ray.maxt = end - start
         return ray, dr.full(mi.Bool, True, dr.width(ray)) & mi.Bool(seen)
 
