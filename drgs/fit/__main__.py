@@ -10,13 +10,12 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drgs.cli.commands import MAX_PORT, CommandParser, bounded_int, file_or_folder, run_command
+from drgs.cli.commands import PORT, CommandParser, file_or_folder, run_command
 from drgs.cli.ending import INTERRUPTED_STATUS
 from drgs.cli.execution import add_execution_arguments, execution_settings
 from drgs.config.changes import with_iterations
@@ -41,11 +40,6 @@ MIN_EXAMINED_SECONDS = 100  # of a --budget: no short fit ends within a tenth of
 LOADING_SECONDS = 1.2  # before run(), for imports; --budget includes them
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of ``python -m drgs.fit``."""
-    run_command(add_arguments, "python -m drgs.fit", arguments)
-
-
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.description = "Fit 3D Gaussians to posed photographs."
@@ -54,7 +48,7 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s scenes/photos.yml --data DIR --out out/mine",
         "%(prog)s --resume out/mine",
     )
-    parser.set_help_footer(describe_extensions)
+    parser.more_help = describe_extensions
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
         "config",
@@ -87,24 +81,15 @@ def add_arguments(parser: CommandParser) -> None:
         metavar="TIME",
         help="90s, 5m, 1h30m: plan a fit that ends within this time, results included",
     )
-    _add_viewing(parser)
-    add_execution_arguments(parser)
-    parser.set_defaults(run=run, is_shared=True, prog=parser.prog)
-
-
-def _add_viewing(parser: CommandParser) -> None:
     group = parser.add_argument_group("viewing", "These do not change the result.")
     group.add_argument(
         "--view",
         action="store_true",
         help="show the running fit on a web page, with buttons to pause and end it (extra: viewer)",
     )
-    group.add_argument(
-        "--view-port",
-        type=bounded_int(1, MAX_PORT),
-        metavar="N",
-        help="port of the page (default: first free port from 8080)",
-    )
+    group.add_argument("--view-port", **PORT)
+    add_execution_arguments(parser)
+    parser.set_defaults(run=run, is_shared=True, prog=parser.prog)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -212,6 +197,8 @@ def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:
         config, name = load_config(args.config, overrides), args.config.stem
     return config, config.output.dir or Path("out") / name
 
+
+main = partial(run_command, add_arguments, "python -m drgs.fit")
 
 if __name__ == "__main__":
     main()
