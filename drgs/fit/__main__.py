@@ -10,10 +10,9 @@ import json
 import signal
 import sys
 import time
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from drgs.cli.commands import PORT, CommandParser, file_or_folder, run_command
 from drgs.cli.ending import INTERRUPTED_STATUS
@@ -31,9 +30,6 @@ from drgs.fit.fit_folder import FitFolder
 from drgs.fit.session import FitSession
 from drgs.results.folder import CONFIG, has_results, load_moved_config, load_run_config
 from drgs.training.parallel.communicator import Communicator
-
-if TYPE_CHECKING:  # imported with --view
-    from drgs.live_page.server import LocalServer
 
 MIN_EXAMINED_SECONDS = 100  # of a --budget: no short fit ends within a tenth of less
 
@@ -104,13 +100,15 @@ def run(args: argparse.Namespace) -> None:
         if not comm.is_root:
             session.run()
             return
-        server = blocks.enter_context(page_server(args))
+        if args.view:
+            serve_live_view(session, args.view_port, blocks)
+        elif args.view_port is not None:
+            raise UserError("--view-port: needs --view")
         session.config, out = read_inputs(args)
         session.folder = FitFolder(out, args.command, args.resume is not None, args.overwrite)
         if args.config is not None and args.config.is_dir():
             choose_effects(session, session.config, session.folder)
         session.uses_terminal = True
-        session.on_start = partial(add_live_view, server)
         finished = session.run()
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")
@@ -143,28 +141,22 @@ def communicator(args: argparse.Namespace) -> Communicator:
     return comm
 
 
-def add_live_view(server: LocalServer | None, session: FitSession) -> None:
-    """Add an observer for the server's page, if there is one."""
-    if server is not None:
+def serve_live_view(session: FitSession, port: int | None, blocks: ExitStack) -> None:
+    """Serve a page until ``blocks`` ends, which observes the fit from its start."""
+    require_module("viser", "viewer", "--view")
+    from drgs.live_page.server import run_server, url
+
+    server = blocks.enter_context(run_server(port, "--view-port"))
+
+    def observe(session: FitSession) -> None:
         from drgs.fit.live_view import watch
-        from drgs.live_page.server import url
 
         trainer = session.trainer
         viewer, session.continues = watch(server, trainer, trainer.dataset, session.continues)
         session.observers.append(viewer)
         print(f"live view: {url(server)}", flush=True)
 
-
-def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer | None]:
-    """Return the server of ``--view``'s page; None without it."""
-    if not args.view:
-        if args.view_port is not None:
-            raise UserError("--view-port: needs --view")
-        return nullcontext()
-    require_module("viser", "viewer", "--view")
-    from drgs.live_page.server import run_server
-
-    return run_server(args.view_port, "--view-port")
+    session.on_start = observe
 
 
 def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:

@@ -23,7 +23,6 @@ from drgs.core.errors import UserError
 from drgs.core.files import atomic_path, write_json
 from drgs.core.folders import sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
-from drgs.effects.base import ChosenEffects
 from drgs.fit.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.fit.inputs import versions
 from drgs.fit.loop import History
@@ -116,15 +115,10 @@ class FitFolder:
         else:
             folder.claim_output_folder(self.path, config, images)
 
-    def write_plan(self, text: str) -> None:
-        """Write the plan and its reasons."""
-        with atomic_path(self.path / folder.BUDGET_PLAN) as temporary:
+    def write_text(self, name: str, text: str) -> None:
+        """Write a plan, or what an examination chose, with the reasons."""
+        with atomic_path(self.path / name) as temporary:
             temporary.write_text(text)
-
-    def write_examination(self, examination: ChosenEffects) -> None:
-        """Write what was chosen, and why."""
-        with atomic_path(self.path / folder.EXAMINATION) as temporary:
-            temporary.write_text(examination.to_json())
 
     def with_examination(self, config: FitConfig) -> FitConfig | None:
         """Return the configuration with what an examination chose for the run in the folder.
@@ -187,7 +181,10 @@ class FitFolder:
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
             metrics["viewers"] = SplitMetrics(**vars(quality), split=split)
         if output.report:
-            shown = gaussians_on_page(gaussians, approximations, other)
+            if other is not None and not shows_as_fitted(approximations):
+                shown = DisplaySettings(other, Approximations())
+            else:
+                shown = DisplaySettings(_remove_filter(gaussians), approximations)
             scene = trainer.full_scene()
             assert scene is not None, "rank 0 writes the results"
             fitted = FitImages(scene, gaussians, render, shown)
@@ -253,15 +250,6 @@ def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
     """
     gaussians = replace(gaussians, rendered_with=config.model.approximations.non_default or None)
     return _remove_filter(gaussians) if config.output.bake_smoothing else gaussians
-
-
-def gaussians_on_page(
-    gaussians: Gaussians, approximations: Approximations, for_viewers: Gaussians | None
-) -> DisplaySettings:
-    """Return the Gaussians of ``viewer.html``: those for viewers if it cannot render the fit's."""
-    if for_viewers is not None and not shows_as_fitted(approximations):
-        return DisplaySettings(for_viewers, Approximations())
-    return DisplaySettings(_remove_filter(gaussians), approximations)
 
 
 def _remove_filter(gaussians: Gaussians) -> Gaussians:

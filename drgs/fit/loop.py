@@ -75,10 +75,6 @@ class History(FitHistory):
         """Write down a change of the population; waits for nothing."""
         self.density.append(DensityRow(**asdict(report), iteration=iteration))
 
-    def add_test_psnr(self, psnr: float) -> None:
-        """Record the PSNR of the last row's Gaussians on test views, dB."""
-        self.rows[-1] = replace(self.rows[-1], test_psnr=psnr)
-
     def leave_out(self, seconds: float) -> None:
         """Subtract time since the last row that was no part of the fit."""
         self._started += seconds
@@ -176,13 +172,13 @@ class HeldOutQuality(Observer):
         pairs = zip(trainer.images(self._views), self._views, strict=True)
         scores = [psnr(image, view.image, view.mask) for image, view in pairs]
         mean = np.mean(scores) if scores else np.nan
-        history.add_test_psnr(float(trainer.comm.broadcast_numbers(mean)))
+        test_psnr = float(trainer.comm.broadcast_numbers(mean))
+        history.rows[-1] = replace(history.rows[-1], test_psnr=test_psnr)
         history.leave_out(time.perf_counter() - start)
 
 
 def measurement_is_due(rows: Sequence[HistoryRow], iterations: int) -> bool:
     """Return whether the last of ``rows`` is to be measured; iterations: of the whole fit."""
     before = max((row.iteration for row in rows if row.test_psnr is not None), default=0)
-    return rows[-1].iteration - before >= max(
-        MIN_ITERATIONS_BETWEEN, iterations // NUM_MEASUREMENTS
-    )
+    every = max(MIN_ITERATIONS_BETWEEN, iterations // NUM_MEASUREMENTS)
+    return rows[-1].iteration - before >= every

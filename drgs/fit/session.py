@@ -53,6 +53,7 @@ from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import description_of_start, gaussians_at, start_of
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import format_effects
+from drgs.results.folder import BUDGET_PLAN, EXAMINATION
 from drgs.results.history import HistoryRow
 from drgs.training.contracts import NO_PARTS, GivenParts
 from drgs.training.density.strategy import DensityStrategy
@@ -128,11 +129,12 @@ class FitSession:
             if folder is not None:
                 folder.claim(*self._inputs)
                 if self.examination is not None:
-                    folder.write_examination(self.examination)
+                    folder.write_text(EXAMINATION, self.examination.to_json())
             if plan is not None:
                 self.continues = deadline(plan.end, self.comm)
                 if folder is not None and self.budget is not None:
-                    folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
+                    text = f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n"
+                    folder.write_text(BUDGET_PLAN, text)
             self.on_start(self)
             try:
                 if not self.iterate():

@@ -16,13 +16,7 @@ import numpy as np
 import drgs
 from drgs.cameras.orbits import orbit_of_gaussians
 from drgs.cameras.viewpoints import FIELD_OF_VIEW, Viewpoint
-from drgs.cli.commands import (
-    PORT,
-    VECTOR,
-    CommandParser,
-    file_or_folder,
-    run_command,
-)
+from drgs.cli.commands import PORT, VECTOR, CommandParser, file_or_folder, run_command
 from drgs.cli.ending import StopRequest
 from drgs.cli.execution import add_execution_arguments, execution_settings, select_variant
 from drgs.core.environment import require_module
