@@ -201,7 +201,7 @@ def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
         field = _find(key)
         assert field is not None, "pydantic names fields"
         about = field.description or getattr(field.annotation, "__doc__", "")
-        return f"{where}: {key} is missing: {about}"
+        return f"{where}: {key} is missing: {one_line(about)}"
     if kind == "value_error" and not key:
         # A relation between values that may come from the file and from the command line.
         origin = f"{file} with --set {' '.join(sorted(overridden))}" if overridden else file

@@ -40,32 +40,25 @@ class AdcConfig(Section):
 
     scaled: ClassVar = ("reset_every", "white_background_reset")
 
-    grad_threshold: float = Field(
-        2e-4,
-        gt=0,
-        description="Clone or split a Gaussian whose 2D position gradient has at least this mean "
-        "norm, in NDC units, over the views that it is visible in.",
-    )
-    clone_scale: float = Field(
-        0.01, gt=0, description="Clone up to this largest scale, split above it; in scene extents."
-    )
-    split_count: int = Field(
-        2, ge=2, le=1_000_000, description="Number of samples that replace a split Gaussian."
-    )
-    split_shrink: float = Field(1.6, gt=1, description="Divisor of the samples' scales.")
-    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Remove less opaque Gaussians.")
-    prune_scale: float = Field(
-        0.1,
-        gt=0,
-        description="Remove Gaussians of a larger scale after the first reset; in scene extents.",
-    )
-    reset_every: Count = Field(
-        3000, ge=1, description="Iterations between opacity resets, up to densify.stop."
-    )
-    reset_opacity: float = Field(0.01, gt=0, lt=1, description="Maximum opacity after a reset.")
-    white_background_reset: Count | None = Field(
-        500, ge=1, description="Iteration of an extra reset if the background is white; null: none."
-    )
+    grad_threshold: float = Field(2e-4, gt=0)
+    """Clone or split a Gaussian whose 2D position gradient has at least this mean norm, in NDC
+    units, over the views that it is visible in."""
+    clone_scale: float = Field(0.01, gt=0)
+    """Clone up to this largest scale, split above it; in scene extents."""
+    split_count: int = Field(2, ge=2, le=1_000_000)
+    """Number of samples that replace a split Gaussian."""
+    split_shrink: float = Field(1.6, gt=1)
+    """Divisor of the samples' scales."""
+    prune_opacity: float = Field(0.005, ge=0, lt=1)
+    """Remove less opaque Gaussians."""
+    prune_scale: float = Field(0.1, gt=0)
+    """Remove Gaussians of a larger scale after the first reset; in scene extents."""
+    reset_every: Count = Field(3000, ge=1)
+    """Iterations between opacity resets, up to densify.stop."""
+    reset_opacity: float = Field(0.01, gt=0, lt=1)
+    """Maximum opacity after a reset."""
+    white_background_reset: Count | None = Field(500, ge=1)
+    """Iteration of an extra reset if the background is white; null: none."""
 
     @override
     def check(self, config: FitConfig) -> None:
