@@ -121,7 +121,11 @@ def run(args: argparse.Namespace) -> None:
     with sole_writer(args.out) as keep:
         folder = CaptureFolder(args.out, args.scene, settings, keep)
         folder.check()
-        print(_describe_cameras(settings, len(views)))
+        kind = (
+            f"{len(views)} around the scene, field of view {math.degrees(settings.fov):.4g} degrees"
+        )
+        kind = f"the scene's own sensors, {len(views)}" if settings.cameras == "sensors" else kind
+        print(f"cameras: {kind}")
         try:
             folder.take_images(scene, views)
             folder.write_dataset(scene, views)
@@ -136,13 +140,6 @@ def _given_settings(args: argparse.Namespace) -> dict[str, object]:
     if args.fov is not None:
         given["fov"] = math.radians(args.fov)
     return {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
-
-
-def _describe_cameras(settings: CaptureSettings, count: int) -> str:
-    if settings.cameras == "sensors":
-        return f"cameras: the scene's own sensors, {count}"
-    fov = math.degrees(settings.fov)
-    return f"cameras: {count} around the scene, field of view {fov:.4g} degrees"
 
 
 main = partial(run_command, add_arguments, "python -m drgs.capture")

@@ -191,10 +191,9 @@ def run_with_arguments(args: argparse.Namespace, render: Render) -> None:
         else:
             data = [] if args.data is None else [f"data.path={args.data}"]
             overrides, background = [*(args.set or ()), *data], parse_background(args.background)
-            effects = args.ignore or ()
-            model = load_model(args.what, args.scene, overrides, background, effects, render)
-            model = replace(model, error=args.error, error_images=bool(args.error_image))
-            render_model(args, model, folder)
+            model = load_model(args.what, args.scene, overrides, background, args.ignore or ())
+            error = {"error": args.error, "error_images": bool(args.error_image)}
+            render_model(args, replace(model, render=render, **error), folder)
         print(f"written: {args.out}")
 
 

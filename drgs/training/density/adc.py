@@ -7,7 +7,6 @@ except where a docstring states otherwise. Rows are chosen on the host; ties are
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, cast
 
@@ -188,16 +187,6 @@ class AdaptiveDensityControl(DensityStrategy):
         ceiling = math.log(opacity / (1 - opacity))
         logits = population.value("logit_opacities")
         population.replace("logit_opacities", dr.select(logits > ceiling, ceiling, logits))
-
-    @override
-    def state(self) -> dict[str, np.ndarray]:
-        return {"gradient_norms": np.array(self.gradient_norms), "views": np.array(self.views)}
-
-    @override
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        float_type = type(self.views)
-        self.gradient_norms = from_host(float_type, state["gradient_norms"])
-        self.views = from_host(float_type, state["views"])
 
     @override
     def max_num_gaussians(self, start: int, iterations: int) -> int:

@@ -168,11 +168,11 @@ class GrowthToNumber(DensityStrategy):
 
     @override
     def state(self) -> dict[str, np.ndarray]:
-        return {"errors": np.array(self.errors), "first": np.array(self.first)}
+        return {**super().state(), "first": np.array(self.first)}
 
     @override
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        self.errors = from_host(type(self.errors), state["errors"])
+        super().restore(state)
         self.first = int(state["first"])
 
     @override
