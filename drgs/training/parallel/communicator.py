@@ -56,6 +56,11 @@ class Communicator:
 
     comm: Any = field(default_factory=SingleProcess)  # mpi4py.MPI.Comm
     num_on_machine: int = 1  # of the processes, those on this machine
+    rank: int = field(init=False)  # the number of this process
+    size: int = field(init=False)  # the number of processes
+
+    def __post_init__(self) -> None:
+        self.rank, self.size = self.comm.Get_rank(), self.comm.Get_size()
 
     @classmethod
     def world(cls) -> Communicator:
@@ -64,16 +69,6 @@ class Communicator:
 
         here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED)
         return cls(MPI.COMM_WORLD.Dup(), here.Get_size())
-
-    @property
-    def rank(self) -> int:
-        """The number of this process."""
-        return self.comm.Get_rank()
-
-    @property
-    def size(self) -> int:
-        """The number of processes."""
-        return self.comm.Get_size()
 
     @property
     def is_root(self) -> bool:
