@@ -8,6 +8,7 @@ and the properties of the plugin ``splats`` (``drgs.integrator.properties``).
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
@@ -36,22 +37,22 @@ class Limits:
 
     def allow(self, value: float) -> bool:
         """Return whether ``value``, in single precision as in kernels, is allowed; NaN never is."""
-        if isinstance(value, float) and not (self.or_infinite and value == math.inf):
+        if self.or_infinite and value == math.inf:
+            return True
+        if isinstance(value, float):
             with np.errstate(over="ignore"):
                 value = float(np.float32(value))
-        return (
-            (self.gt is None or value > self.gt)
-            and (self.ge is None or value >= self.ge)
-            and (self.lt is None or value < self.lt)
-            and (self.le is None or value <= self.le or (self.or_infinite and value == math.inf))
-            and value == value  # not NaN
-        )
+        return all(getattr(operator, k)(value, limit) for k, limit in self._given.items())
 
     @property
     def finite(self) -> dict[str, float]:
         """The finite limits by name."""
-        given = {name: getattr(self, name) for name in ("gt", "ge", "lt", "le")}
-        return {k: v for k, v in given.items() if v is not None and math.isfinite(v)}
+        return {name: limit for name, limit in self._given.items() if math.isfinite(limit)}
+
+    @property
+    def _given(self) -> dict[str, float]:
+        limits = {name: getattr(self, name) for name in ("gt", "ge", "lt", "le")}
+        return {name: limit for name, limit in limits.items() if limit is not None}
 
 
 PROJECTIONS = ClassRegistry("projection", "drgs.projections")

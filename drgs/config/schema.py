@@ -137,7 +137,7 @@ class InitConfig(Section):
     coloured from the images. points: a point cloud. random: in the start box, or where the cameras
     look. auto: point_cloud or half_extent if given; else masks if nearly all training images are
     partly transparent; else the dataset's point cloud if it has one; else random."""
-    num_points: Count | None = Field(None, ge=4, le=100_000_000)
+    num_points: Resolved[Count] = Field(UNRESOLVED, ge=4, le=100_000_000)
     """Number of random points, or maximum number on the hull. null: 100,000 with the strategy adc,
     else two fifths of the final number."""
     half_extent: float | None = Field(None, gt=0, le=1e9)

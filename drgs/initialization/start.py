@@ -185,7 +185,7 @@ def _hull_start(
         if config.init.half_extent is not None:
             raise
         return None
-    means = hull_points(silhouettes, box, _num_points(config.init), config.seed)
+    means = hull_points(silhouettes, box, config.init.num_points, config.seed)
     if len(means) <= NUM_NEIGHBOURS:
         return None
     what = f"{len(means):,} points on the hull of {len(silhouettes)} masks"
@@ -251,13 +251,8 @@ def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray |
     return positions, colors / np.float32(255), len(kept)
 
 
-def _num_points(init: InitConfig) -> int:
-    assert init.num_points is not None, "resolve_defaults sets it"
-    return init.num_points
-
-
 def _random_start(config: FitConfig, dataset: Dataset) -> Start:
-    num_points, rng = _num_points(config.init), np.random.default_rng(config.seed)
+    num_points, rng = config.init.num_points, np.random.default_rng(config.seed)
     what, box = f"{num_points:,} random points", start_box_of(config.init, dataset)
     if box is not None:
         return Start(box.points(num_points, rng), None, f"{what} in {box}")
