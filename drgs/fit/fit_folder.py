@@ -21,7 +21,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.environment import processor
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path, write_json
-from drgs.core.folders import sole_writer
+from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
 from drgs.fit.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.fit.inputs import versions
@@ -239,7 +239,7 @@ class FitFolder:
         if metrics is not None:
             write_json(self.path / folder.METRICS, metrics, indent=2)
         remove_checkpoint(self.path)
-        folder.seal_run(self.path)
+        FolderRecord(self.path, folder.COMMAND).seal()
 
 
 def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:

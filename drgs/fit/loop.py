@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import accumulate
 from typing import Protocol
 
@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from drgs.config.changes import with_changes
 from drgs.datasets.types import View, evenly_spaced
-from drgs.results.history import DENSITY_COLUMNS, DensityReport, DensityRow, FitHistory, HistoryRow
+from drgs.results.history import DENSITY_COLUMNS, DensityReport, DensityRow, HistoryRow
 from drgs.results.metrics import psnr
 from drgs.training.trainer import StepReport, Trainer
 
@@ -26,24 +26,24 @@ NUM_MEASUREMENTS, MIN_ITERATIONS_BETWEEN = 10, 100
 """About how often a fit is measured, and the fewest iterations between two measurements."""
 
 
-class History(FitHistory):
+@dataclass(eq=False)
+class History:
     """The tables of a fit that runs, and the time spent, also before an interruption."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._before = 0.0
-        self._started = time.perf_counter()
+    rows: list[HistoryRow] = field(default_factory=list)
+    density: list[DensityRow] = field(default_factory=list)
+    _before: float = 0.0
+    _started: float = field(default_factory=lambda: time.perf_counter())
 
     @staticmethod
     def from_arrays(rows: np.ndarray, density: np.ndarray, wall_s: float) -> History:
         """Return the inverse of :meth:`arrays`; the clock continues from ``wall_s``."""
-        history = History()
+        history = History(_before=wall_s)
         for i, loss, view_psnr, n, lr, at, test_psnr in rows:
             measured = None if math.isnan(test_psnr) else float(test_psnr)
             history.rows.append(HistoryRow(int(i), loss, view_psnr, int(n), lr, at, measured))
         for row in density.tolist():
             history.density.append(DensityRow(**dict(zip(DENSITY_COLUMNS, row, strict=True))))
-        history._before = wall_s
         return history
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
