@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -23,10 +23,12 @@ from drgs.core.errors import UserError
 from drgs.core.files import atomic_path, write_json
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
+from drgs.effects.smoothing import bake_smoothing
 from drgs.fit.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.fit.inputs import versions
 from drgs.fit.loop import History
 from drgs.fit.report import MAX_PICTURES, FitImages, write_images, write_results
+from drgs.fit.viewers_fit import ForViewers
 from drgs.gaussians.parameters import Gaussians
 from drgs.results import folder
 from drgs.results.history import HistoryRow, write_density, write_history
@@ -34,9 +36,6 @@ from drgs.results.html_viewer import DisplaySettings, shows_as_fitted
 from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
 from drgs.results.refined_cameras import write_views
 from drgs.training.trainer import Trainer
-
-if TYPE_CHECKING:  # imported where it is needed
-    from drgs.fit.viewers_fit import ForViewers
 
 
 @dataclass(eq=False)
@@ -184,7 +183,7 @@ class FitFolder:
             if other is not None and not shows_as_fitted(approximations):
                 shown = DisplaySettings(other, Approximations())
             else:
-                shown = DisplaySettings(_remove_filter(gaussians), approximations)
+                shown = DisplaySettings(bake_smoothing(gaussians), approximations)
             scene = trainer.full_scene()
             assert scene is not None, "rank 0 writes the results"
             fitted = FitImages(scene, gaussians, render, shown)
@@ -249,12 +248,4 @@ def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
     ``output.bake_smoothing``.
     """
     gaussians = replace(gaussians, rendered_with=config.model.approximations.non_default or None)
-    return _remove_filter(gaussians) if config.output.bake_smoothing else gaussians
-
-
-def _remove_filter(gaussians: Gaussians) -> Gaussians:
-    if gaussians.smoothing is None:
-        return gaussians
-    from drgs.effects.smoothing import bake_smoothing
-
-    return bake_smoothing(gaussians)
+    return bake_smoothing(gaussians) if config.output.bake_smoothing else gaussians

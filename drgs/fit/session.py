@@ -12,7 +12,6 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING
 
 import mitsuba as mi
 from typing_extensions import override
@@ -48,6 +47,7 @@ from drgs.fit.loop import (
 )
 from drgs.fit.memory import room_for_targets
 from drgs.fit.summary import summary_of_fit
+from drgs.fit.viewers_fit import ForViewers, for_viewers, num_iterations
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import description_of_start, gaussians_at, start_of
@@ -61,9 +61,6 @@ from drgs.training.finite_checks import NonFiniteError
 from drgs.training.losses import Loss, LossTerm
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import StepReport, Trainer
-
-if TYPE_CHECKING:  # imported where it is needed
-    from drgs.fit.viewers_fit import ForViewers
 
 
 class ProgressLine(Observer):
@@ -320,19 +317,16 @@ class FitSession:
             )
         release_unused_memory()  # encoding the orbit's frames takes as much as iterations do
         trainer.full_scene()  # gathered from all ranks
-        for_viewers = None
+        others = None
         if not trainer.config.model.approximations.is_default:
-            for_viewers = self._fit_for_viewers(gaussians)
+            others = self._fit_for_viewers(gaussians)
         if self.folder is not None:
-            metrics = self.folder.write_results(
-                trainer, self.history, gaussians, for_viewers, wall_s
-            )
+            results = trainer, self.history, gaussians, others, wall_s
+            metrics = self.folder.write_results(*results)
             self._print(self.folder.describe(metrics))
 
     def _fit_for_viewers(self, gaussians: Gaussians) -> ForViewers:
         """Return Gaussians for other viewers; the trainer is released, and renders the fit's."""
-        from drgs.fit.viewers_fit import for_viewers, num_iterations
-
         if not self.uses_terminal:
             return for_viewers(self.trainer, gaussians)
         total = num_iterations(self.trainer.config)

@@ -12,6 +12,7 @@ from drgs.config.extensions import STRATEGIES
 from drgs.config.schema import NAMED_COLORS, NEAR_LIMITS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.types import Dataset
+from drgs.initialization.visual_hull import MAX_EMPTY_ALPHA, MIN_TRANSPARENT_SHARE
 
 NEAR_SHARE = 0.04
 """The near plane is this share of the cameras' distance to their focus, rounded to one digit: the
@@ -103,8 +104,6 @@ def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
 
 def _is_cut_out(dataset: Dataset) -> bool:
     """Return whether most of some images are transparent in part."""
-    from drgs.initialization.visual_hull import MAX_EMPTY_ALPHA, MIN_TRANSPARENT_SHARE
-
     some = dataset.train[:: -(-len(dataset.train) // NUM_ALPHA_VIEWS) or 1]
     alphas = (np.asarray(view.alpha) for view in some if view.alpha is not None)
     shares = [float(np.mean(alpha <= MAX_EMPTY_ALPHA)) for alpha in alphas]  # one at a time

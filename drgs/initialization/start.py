@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -30,11 +29,16 @@ from drgs.initialization.start_box import (
     points_in_view,
     start_box_of,
 )
+from drgs.initialization.visual_hull import (
+    Silhouette,
+    are_masks,
+    hull_points,
+    num_transparent,
+    silhouettes_of,
+)
+from drgs.io.colmap import read_points3d
 from drgs.io.formats import format_to_read
 from drgs.io.ply import read_points
-
-if TYPE_CHECKING:
-    from drgs.initialization.visual_hull import Silhouette
 
 MIN_SPACING = 2.5e-4
 """Smallest first scale, for points that coincide, as a share of the median distance of points from
@@ -120,8 +124,6 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
         return _given_start(config, dataset, init.gaussians)
     is_open = init.start == "auto" and init.point_cloud is None and init.half_extent is None
     if init.start == "masks" or (is_open and any(v.alpha is not None for v in dataset.train)):
-        from drgs.initialization.visual_hull import are_masks, num_transparent, silhouettes_of
-
         silhouettes = silhouettes_of(dataset.train)
         if are_masks(silhouettes, dataset.train):
             if (start := _hull_start(config, dataset, silhouettes)) is not None:
@@ -177,8 +179,6 @@ def _hull_start(
     config: FitConfig, dataset: Dataset, silhouettes: Sequence[Silhouette]
 ) -> Start | None:
     """Return points on the visual hull of the masks; None: it is empty."""
-    from drgs.initialization.visual_hull import hull_points
-
     try:
         box = start_box_of(config.init, dataset) or focus_box(dataset.train)
     except UserError:
@@ -232,8 +232,6 @@ def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray |
             raise UserError(f"{cloud}: holds Gaussians, no points; set init.gaussians to it")
         positions, colors = read_points(cloud)
         return positions, colors, len(positions)
-    from drgs.io.colmap import read_points3d
-
     points = read_points3d(cloud)
     kept = np.ones(len(points.errors), bool)
     if init.max_point_error is not None:

@@ -172,7 +172,7 @@ def test_resumed_fit_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
     config = write_project(tmp_path, model={**VALUES["model"], **FITTED_WITH})
     without_images(monkeypatch)
     with monkeypatch.context() as broken:
-        broken.setattr("drgs.fit.viewers_fit.for_viewers", lambda *_: sys.exit(7))
+        broken.setattr("drgs.fit.session.for_viewers", lambda *_: sys.exit(7))
         with pytest.raises(SystemExit):
             fit.main([str(config), "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
