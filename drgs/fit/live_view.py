@@ -62,10 +62,9 @@ class TrainingViewer(Observer):
         self._fit_s = 0.0  # seconds that the fit's own kernels took here
 
     @override
-    def after_iteration(
-        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
-    ) -> None:
+    def after_iteration(self, done: Iteration, stops: Callable[[], bool]) -> None:
         """Render due frames, and wait while the fit is paused; its clock stops meanwhile."""
+        trainer, history = done.trainer, done.history
         start, self._fit_s = time.perf_counter(), 0.0
         now = time.monotonic()
         is_due = self._requests.pending and now - self._progress_at >= PROGRESS_SECONDS

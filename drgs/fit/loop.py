@@ -103,6 +103,8 @@ def until_planned_end(trainer: Trainer) -> bool:
 class Iteration:
     """A finished step, of one iteration or several."""
 
+    trainer: Trainer
+    history: History
     report: StepReport
     row: HistoryRow | None  # of the history, where this iteration is written down
     is_last: bool
@@ -111,10 +113,8 @@ class Iteration:
 class Observer(Protocol):
     """An observer of a running fit, without influence on its bytes."""
 
-    def after_iteration(
-        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
-    ) -> None:
-        """Called after an iteration, by the thread that fits; history: with its row, if any.
+    def after_iteration(self, done: Iteration, stops: Callable[[], bool]) -> None:
+        """Called after an iteration, by the thread that fits.
 
         stops: whether the fit is to stop at once; an observer that waits has to call it.
         """
@@ -138,7 +138,7 @@ def iterations(
         if is_last or report.passes(trainer.config.output.history_every):
             row = history.add(report)
             trainer.check_iterations()  # reading the row has waited for the device
-        yield Iteration(report, row, is_last)
+        yield Iteration(trainer, history, report, row, is_last)
 
 
 def _is_last(trainer: Trainer, continues: Continues) -> bool:
@@ -157,13 +157,11 @@ class HeldOutQuality(Observer):
         self._views = evenly_spaced(views, MAX_MEASURED_VIEWS)
 
     @override
-    def after_iteration(
-        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
-    ) -> None:
-        config = trainer.config
+    def after_iteration(self, done: Iteration, stops: Callable[[], bool]) -> None:
+        config = done.trainer.config
         is_row = done.row is not None and config.output.report
-        if is_row and (done.is_last or measurement_is_due(history.rows, config.iterations)):
-            self.measure(trainer, history)
+        if is_row and (done.is_last or measurement_is_due(done.history.rows, config.iterations)):
+            self.measure(done.trainer, done.history)
 
     def measure(self, trainer: Trainer, history: History) -> None:
         """Add the mean PSNR to the last row of the history; its clock is paused meanwhile."""

@@ -71,14 +71,12 @@ class ProgressLine(Observer):
         self._psnr: float | None = None  # dB, smooth
 
     @override
-    def after_iteration(
-        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
-    ) -> None:
+    def after_iteration(self, done: Iteration, stops: Callable[[], bool]) -> None:
         if (row := done.row) is not None:
             self._psnr = smoother(self._psnr, row.psnr)
             status = f"loss {row.loss:.4f}  PSNR {self._psnr:5.2f} dB  "
             status += f"Gaussians {row.num_gaussians:,}"
-            total = row.iteration if done.is_last else trainer.config.last_iteration
+            total = row.iteration if done.is_last else done.trainer.config.last_iteration
             self._progress.update(row.iteration, max(row.iteration, total), status)
 
 
@@ -289,7 +287,7 @@ class FitSession:
             for done in iterations(trainer, self.history, self.continues):
                 self.check_ranges()
                 for observer in observers:
-                    observer.after_iteration(trainer, self.history, done, lambda: stop.requested)
+                    observer.after_iteration(done, lambda: stop.requested)
                 stops = bool(comm.broadcast_numbers(stop.requested))
                 every = trainer.config.output.checkpoint_every
                 is_due = every is not None and (done.is_last or done.report.passes(every))

@@ -57,7 +57,7 @@ def run(trainer, queue=None, dataset=None, before=lambda _: None, stops=lambda: 
     for done in iterations(trainer, history, length):
         if queue is not None:
             before(done.report.iteration)
-            watching.after_iteration(trainer, history, done, stops)
+            watching.after_iteration(done, stops)
     screen.refuse.assert_not_called()
     return screen, history
 

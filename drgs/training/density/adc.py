@@ -156,12 +156,7 @@ class AdaptiveDensityControl(DensityStrategy):
         Raises ``UserError`` if no Gaussian would remain: such a fit cannot recover.
         """
         adc, num_before = self.settings, population.num_rows
-        views = np.maximum(np.array(self.views, float), 1)
-        norms = population.gather(np.array(self.gradient_norms, float) / views)
-        with np.errstate(over="ignore"):
-            scales = np.exp(population.host("log_scales")).max(axis=1)
-        opacities = expit(population.host("logit_opacities"))
-        chosen = self._choose_rows(norms, opacities, scales, population.extent, iteration)
+        chosen = self._choose_rows(population, iteration)
         num_added = len(chosen.clone) + len(chosen.split) * adc.split_count
         if len(chosen.keep) + num_added == 0:
             raise UserError(
@@ -198,20 +193,18 @@ class AdaptiveDensityControl(DensityStrategy):
             return max(start, config.max_gaussians)
         return start * self.settings.split_count**changes
 
-    def _choose_rows(
-        self,
-        norms: np.ndarray,
-        opacities: np.ndarray,
-        scales: np.ndarray,
-        extent: float,
-        iteration: int,
-    ) -> _ChosenRows:
-        """Decide about every row; scales: (N,) largest standard deviation, world units.
+    def _choose_rows(self, population: Population, iteration: int) -> _ChosenRows:
+        """Decide about every row.
 
         Comparisons are written such that NaN counts as transparent and as too large. Large ones are
         pruned once the first regular opacity reset is over.
         """
-        config, adc = self.config, self.settings
+        config, adc, extent = self.config, self.settings, population.extent
+        views = np.maximum(np.array(self.views, float), 1)
+        norms = population.gather(np.array(self.gradient_norms, float) / views)
+        with np.errstate(over="ignore"):
+            scales = np.exp(population.host("log_scales")).max(axis=1)  # largest deviations
+        opacities = expit(population.host("logit_opacities"))
         small = scales <= adc.clone_scale * extent
         transparent = ~(opacities >= adc.prune_opacity)
         limit = adc.prune_scale * extent if iteration > adc.reset_every else np.inf
