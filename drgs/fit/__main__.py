@@ -151,8 +151,7 @@ def serve_live_view(session: FitSession, port: int | None, blocks: ExitStack) ->
     def observe(session: FitSession) -> None:
         from drgs.fit.live_view import watch
 
-        trainer = session.trainer
-        viewer, session.continues = watch(server, trainer, trainer.dataset, session.continues)
+        viewer, session.continues = watch(server, session.trainer, session.continues)
         session.observers.append(viewer)
         print(f"live view: {url(server)}", flush=True)
 

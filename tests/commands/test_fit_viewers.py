@@ -54,7 +54,7 @@ def viewer_page(monkeypatch):
     without_images(monkeypatch)
     screen = Mock()
 
-    def watch(server, trainer, dataset, length):
+    def watch(server, trainer, length):
         queue = RenderRequests()
 
         def ask(*_):
@@ -64,7 +64,7 @@ def viewer_page(monkeypatch):
         screen.show_progress.side_effect = lambda t, *_: t.iteration == 4 and queue.end()
         ask()
         length = unless_ended(length, queue)
-        return TrainingViewer(queue, screen, dataset), length
+        return TrainingViewer(queue, screen), length
 
     monkeypatch.setattr(training_viewer, "watch", watch)
     return screen
