@@ -42,15 +42,15 @@ class Limits:
         if isinstance(value, float):
             with np.errstate(over="ignore"):
                 value = float(np.float32(value))
-        return all(getattr(operator, k)(value, limit) for k, limit in self._given.items())
+        return all(getattr(operator, k)(value, limit) for k, limit in self._limits.items())
 
     @property
     def finite(self) -> dict[str, float]:
         """The finite limits by name."""
-        return {name: limit for name, limit in self._given.items() if math.isfinite(limit)}
+        return {name: limit for name, limit in self._limits.items() if math.isfinite(limit)}
 
     @property
-    def _given(self) -> dict[str, float]:
+    def _limits(self) -> dict[str, float]:
         limits = {name: getattr(self, name) for name in ("gt", "ge", "lt", "le")}
         return {name: limit for name, limit in limits.items() if limit is not None}
 
