@@ -84,7 +84,7 @@ def _row(*cells: Sequence[nodes.Node]) -> nodes.row:
 
 def _inline(text: str) -> list[nodes.Node]:
     """Return text in which code and names such as ``densify.stop`` are literals."""
-    pieces = [piece for piece in CODE.split(text) if piece is not None]
+    pieces = [piece for piece in CODE.split(" ".join(text.split())) if piece is not None]
     is_code = [False] + [True, False] * (len(pieces) // 2)
     return [
         nodes.literal("", piece) if code else nodes.Text(piece)

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 
 from drgs.cli.commands import CommandParser, Subcommand, run_command
 
 COMMANDS = {
     "speed": "times of drgs and of other renderers on the same scene, in one run"
 }  # descriptions by module
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of ``python -m drgs.bench``."""
-    run_command(add_arguments, "python -m drgs.bench", arguments)
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -23,6 +18,8 @@ def add_arguments(parser: CommandParser) -> None:
     commands = {name: Subcommand(text, f"drgs.bench.{name}") for name, text in COMMANDS.items()}
     parser.add_commands(commands, metavar="MEASUREMENT")
 
+
+main = partial(run_command, add_arguments, "python -m drgs.bench")
 
 if __name__ == "__main__":
     main()

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -16,11 +16,6 @@ from drgs.core.environment import processor
 from drgs.core.folders import FolderRecord
 from drgs.core.private import llvm_version
 from drgs.results.history import write_csv
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-Row = TypeVar("Row", bound="DataclassInstance")
 
 COMMAND = "bench"
 
@@ -57,7 +52,7 @@ def machine() -> str:
     return f"{processor()}, {dr.thread_count()} threads, LLVM {version}"
 
 
-def write_rows(path: Path, row_type: type[Row], rows: Iterable[Row]) -> None:
+def write_rows(path: Path, row_type: Any, rows: Iterable[object]) -> None:
     """Write instances of the dataclass ``row_type``, a column per field."""
     names = [field.name for field in fields(row_type)]
     write_csv(path, names, [[getattr(row, name) for name in names] for row in rows])

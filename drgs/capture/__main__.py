@@ -11,13 +11,15 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Sequence
 from dataclasses import fields, replace
+from functools import partial
 
 from drgs.capture.camera_placement import ENOUGH_SENSORS, KINDS, settings_for, views_of
 from drgs.capture.dataset import POINTS, CaptureFolder
 from drgs.capture.path_tracing import CaptureSettings, load_scene, refuse_splats, require_sight
 from drgs.cli.commands import (
+    SIZE,
+    VECTOR,
     CommandParser,
     bounded_int,
     degrees,
@@ -42,11 +44,6 @@ WHOLE_NUMBERS = {
 """Smallest value, largest value and help by name of the setting."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of ``python -m drgs.capture``."""
-    run_command(add_arguments, "python -m drgs.capture", arguments)
-
-
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
     parser.description = "Turn a Mitsuba scene into a training set in the NeRF-synthetic layout."
@@ -61,13 +58,7 @@ def add_arguments(parser: CommandParser) -> None:
             metavar="N",
             help=f"{text} (default: {getattr(CaptureSettings, name)})",
         )
-    add(
-        "--size",
-        type=bounded_int(1),
-        nargs=2,
-        metavar=("W", "H"),
-        help="px (default: 400 400); their background is transparent",
-    )
+    add("--size", **SIZE, help="px (default: 400 400); their background is transparent")
     _add_cameras(parser)
     add_variant_argument(parser)
     parser.set_defaults(run=run)
@@ -95,13 +86,8 @@ def _add_cameras(parser: CommandParser) -> None:
         type=finite_number,
         help="of the cameras from the target (default: the whole scene is in the image)",
     )
-    add(
-        "--target",
-        type=finite_number,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="what the cameras look at (default: the middle of the bounding box)",
-    )
+    what = "what the cameras look at (default: the middle of the bounding box)"
+    add("--target", **VECTOR, help=what)
     add(
         "--up",
         choices=("x", "y", "z", "-x", "-y", "-z"),
@@ -135,7 +121,11 @@ def run(args: argparse.Namespace) -> None:
     with sole_writer(args.out) as keep:
         folder = CaptureFolder(args.out, args.scene, settings, keep)
         folder.check()
-        print(_describe_cameras(settings, len(views)))
+        kind = (
+            f"{len(views)} around the scene, field of view {math.degrees(settings.fov):.4g} degrees"
+        )
+        kind = f"the scene's own sensors, {len(views)}" if settings.cameras == "sensors" else kind
+        print(f"cameras: {kind}")
         try:
             folder.take_images(scene, views)
             folder.write_dataset(scene, views)
@@ -152,12 +142,7 @@ def _given_settings(args: argparse.Namespace) -> dict[str, object]:
     return {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
 
 
-def _describe_cameras(settings: CaptureSettings, count: int) -> str:
-    if settings.cameras == "sensors":
-        return f"cameras: the scene's own sensors, {count}"
-    fov = math.degrees(settings.fov)
-    return f"cameras: {count} around the scene, field of view {fov:.4g} degrees"
-
+main = partial(run_command, add_arguments, "python -m drgs.capture")
 
 if __name__ == "__main__":
     main()

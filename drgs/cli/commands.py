@@ -28,8 +28,6 @@ from drgs.core.errors import UserError, did_you_mean, one_line
 from drgs.core.processes import end_job_on_error, process_count, root_output_only
 from drgs.core.registry import ExtensionError, reporting_extensions
 
-MAX_PORT = 65535  # of TCP
-
 
 class Subcommand(NamedTuple):
     """A command among several."""
@@ -45,17 +43,13 @@ class CommandParser(argparse.ArgumentParser):
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **settings)
         self._module = module
         self._subcommands: tuple[str, ...] = ()
-        self._more_help: Callable[[], str] = str
+        self.more_help: Callable[[], str] = str  # ends the help; called when this is shown
         shown = "print the traceback of an extension's error"
         self.add_argument("--traceback", action="store_true", default=argparse.SUPPRESS, help=shown)
 
-    def set_help_footer(self, text: Callable[[], str]) -> None:
-        """End the help with ``text()``, called when the help is shown."""
-        self._more_help = text
-
     @override
     def format_help(self) -> str:
-        more = self._more_help()
+        more = self.more_help()
         return super().format_help() + (f"\n{more}\n" if more else "")
 
     def show_examples(self, *lines: str) -> None:
@@ -187,3 +181,14 @@ def degrees(text: str) -> float:
     if not 0 < angle < 180:
         raise argparse.ArgumentTypeError(f"must be between 0 and 180 degrees, got {text}")
     return angle
+
+
+VECTOR: dict[str, Any] = {"type": finite_number, "nargs": 3, "metavar": ("X", "Y", "Z")}
+SIZE: dict[str, Any] = {"type": bounded_int(1), "nargs": 2, "metavar": ("W", "H")}
+PORT: dict[str, Any] = {
+    "type": bounded_int(1, 65535),
+    "metavar": "N",
+    "help": "port of the page (default: first free port from 8080)",
+}
+"""Settings of options for a point or direction, for an image's size in px, and for a page's port.
+"""

@@ -8,6 +8,7 @@ and the properties of the plugin ``splats`` (``drgs.integrator.properties``).
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
@@ -36,22 +37,22 @@ class Limits:
 
     def allow(self, value: float) -> bool:
         """Return whether ``value``, in single precision as in kernels, is allowed; NaN never is."""
-        if isinstance(value, float) and not (self.or_infinite and value == math.inf):
+        if self.or_infinite and value == math.inf:
+            return True
+        if isinstance(value, float):
             with np.errstate(over="ignore"):
                 value = float(np.float32(value))
-        return (
-            (self.gt is None or value > self.gt)
-            and (self.ge is None or value >= self.ge)
-            and (self.lt is None or value < self.lt)
-            and (self.le is None or value <= self.le or (self.or_infinite and value == math.inf))
-            and value == value  # not NaN
-        )
+        return all(getattr(operator, k)(value, limit) for k, limit in self._limits.items())
 
     @property
     def finite(self) -> dict[str, float]:
         """The finite limits by name."""
-        given = {name: getattr(self, name) for name in ("gt", "ge", "lt", "le")}
-        return {k: v for k, v in given.items() if v is not None and math.isfinite(v)}
+        return {name: limit for name, limit in self._limits.items() if math.isfinite(limit)}
+
+    @property
+    def _limits(self) -> dict[str, float]:
+        limits = {name: getattr(self, name) for name in ("gt", "ge", "lt", "le")}
+        return {name: limit for name, limit in limits.items() if limit is not None}
 
 
 PROJECTIONS = ClassRegistry("projection", "drgs.projections")
@@ -123,17 +124,8 @@ class Declared:
 Default = TypeVar("Default", bool, int, float, str)
 
 
-def _declare(
-    default: Default,
-    description: str,
-    limits: Limits | None = None,
-    *,
-    choices: tuple[str, ...] = (),
-    registry: ClassRegistry | None = None,
-    decimal: float | None = None,
-) -> Default:
-    declared = Declared(default, description, choices, registry, limits, decimal)
-    return field(default=default, metadata={"declared": declared})
+def _declare(default: Default, description: str, **rules: Any) -> Default:
+    return field(default=default, metadata={"declared": Declared(default, description, **rules)})
 
 
 @dataclass(frozen=True)
@@ -163,7 +155,7 @@ class Approximations:
     order_window: int = _declare(
         4,
         "Number of splats that a pixel buffers to sort them, if order is pixel.",
-        Limits("from 1 to 64", ge=1, le=64),
+        limits=Limits("from 1 to 64", ge=1, le=64),
     )
     sh_direction: str = _declare(
         "mean",
@@ -173,29 +165,29 @@ class Approximations:
     alpha_max: float = _declare(
         ALPHA_MAX,
         "Upper clamp of a splat's alpha.",
-        Limits("above 0 and below 1 in float32", gt=0, lt=1),
+        limits=Limits("above 0 and below 1 in float32", gt=0, lt=1),
         decimal=0.99,
     )
     alpha_cut: float = _declare(
         ALPHA_CUT,
         "Minimum alpha, which bounds the extent of splats; 0: unbounded.",
-        Limits("from 0 to below 1", ge=0, lt=1),
+        limits=Limits("from 0 to below 1", ge=0, lt=1),
         decimal=1 / 255,
     )
     transmittance_stop: float = _declare(
         TRANSMITTANCE_STOP,
         "Minimum transmittance of a pixel, at which compositing stops; 0: never.",
-        Limits("from 0 to below 1", ge=0, lt=1),
+        limits=Limits("from 0 to below 1", ge=0, lt=1),
     )
     extent: float = _declare(
         math.inf,
         "Extent of splats, in standard deviations.",
-        Limits("above 0, and at most 1e9 or infinite", gt=0, le=1e9, or_infinite=True),
+        limits=Limits("above 0, and at most 1e9 or infinite", gt=0, le=1e9, or_infinite=True),
     )
     low_pass: float = _declare(
         LOW_PASS,
         "Variance added to the image-space covariance of each splat, px²; 0: none.",
-        Limits("finite and not negative", ge=0, lt=math.inf),
+        limits=Limits("finite and not negative", ge=0, lt=math.inf),
     )
     antialiased: bool = _declare(
         False,

@@ -21,18 +21,14 @@ class PruneConfig(Section):
     removed: ClassVar = {"method": "selection", "opacity": 0.005, "opacity_rate": 4.0}
     scaled: ClassVar = ("start", "stop")
 
-    to: Count | None = Field(
-        None, ge=1, description="Maximum number of Gaussians at the end; null: no pruning."
-    )
-    start: Count | None = Field(
-        None,
-        ge=1,
-        description="Iteration after which it begins, at least densify.stop. null: densify.stop.",
-    )
-    stop: Count | None = Field(
-        None, ge=2, description="Iteration of the last change. null: half of the remaining ones."
-    )
-    every: Count = Field(50, ge=1, description="Iterations between two changes.")
+    to: Count | None = Field(None, ge=1)
+    """Maximum number of Gaussians at the end; null: no pruning."""
+    start: Count | None = Field(None, ge=1)
+    """Iteration after which it begins, at least densify.stop. null: densify.stop."""
+    stop: Count | None = Field(None, ge=2)
+    """Iteration of the last change. null: half of the remaining ones."""
+    every: Count = Field(50, ge=1)
+    """Iterations between two changes."""
 
 
 class DensifyConfig(ExtensibleSection):
@@ -42,35 +38,23 @@ class DensifyConfig(ExtensibleSection):
     removed: ClassVar = {"stop_aims": []}
     scaled: ClassVar = ("start", "stop")
 
-    strategy: Annotated[str, name_of(STRATEGIES)] = Field(
-        "budget",
-        description="How the population changes. adc: adaptive density control, as in the paper "
-        "(Kerbl et al. 2023); budget: growth to a given number of Gaussians, where errors are "
-        "largest; mcmc: relocation and noise (Kheradmand et al. 2024). Or the name of an "
-        "extension.",
-    )
-    start: Resolved[Count] = Field(
-        REFERENCE_START,
-        ge=0,
-        description="Last iteration before the first change. Not given, or null: 500, but at most "
-        "half of stop and, with budget and mcmc, a twentieth of all iterations.",
-    )
-    stop: Resolved[Count] = Field(
-        REFERENCE_STOP,
-        ge=1,
-        description="Changes and resets end before this iteration; with budget, the last change is "
-        "at this iteration. Not given, or null: 3/4 of the iterations with budget, else 5/7 of "
-        "them; with adc at most 15,000.",
-    )
-    every: Count = Field(100, ge=1, description="Iterations between two changes.")
-    max_gaussians: int = Field(
-        1_000_000, ge=4, le=100_000_000, description="Limit that the population never exceeds."
-    )
-    remove_floaters: bool = Field(
-        True,
-        description="Remove Gaussians close before a few cameras, after 50, 70 and 90 % of the "
-        "iterations.",
-    )
+    strategy: Annotated[str, name_of(STRATEGIES)] = "budget"
+    """How the population changes. adc: adaptive density control, as in the paper (Kerbl et al.
+    2023); budget: growth to a given number of Gaussians, where errors are largest; mcmc: relocation
+    and noise (Kheradmand et al. 2024). Or the name of an extension."""
+    start: Resolved[Count] = Field(REFERENCE_START, ge=0)
+    """Last iteration before the first change. Not given, or null: 500, but at most half of stop
+    and, with budget and mcmc, a twentieth of all iterations."""
+    stop: Resolved[Count] = Field(REFERENCE_STOP, ge=1)
+    """Changes and resets end before this iteration; with budget, the last change is at this
+    iteration. Not given, or null: 3/4 of the iterations with budget, else 5/7 of them; with adc at
+    most 15,000."""
+    every: Count = Field(100, ge=1)
+    """Iterations between two changes."""
+    max_gaussians: int = Field(1_000_000, ge=4, le=100_000_000)
+    """Limit that the population never exceeds."""
+    remove_floaters: bool = True
+    """Remove Gaussians close before a few cameras, after 50, 70 and 90 % of the iterations."""
     prune: PruneConfig = subsection(PruneConfig)
 
     @property

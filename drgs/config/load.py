@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import get_args
 
@@ -58,19 +58,19 @@ def dump_config(config: FitConfig, path: str | Path) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def known_keys() -> list[str]:
+def known_keys(model: type[BaseModel] = FitConfig, prefix: str = "") -> list[str]:
     """Return dotted names of every section and value, such as ``densify.every``."""
-    return list(_keys(FitConfig))
-
-
-def _keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
-    sections = {name: _section(field.annotation) for name, field in model.model_fields.items()}
+    sections, keys = (
+        {name: _section(field.annotation) for name, field in model.model_fields.items()},
+        [],
+    )
     if issubclass(model, ExtensibleSection):
         sections |= {extension.name: extension.section for extension in model.extensions()}
     for name, section in sections.items():
-        yield prefix + name
+        keys.append(prefix + name)
         if section is not None:
-            yield from _keys(section, f"{prefix}{name}.")
+            keys += known_keys(section, f"{prefix}{name}.")
+    return keys
 
 
 def _find(key: str) -> FieldInfo | None:
@@ -201,7 +201,7 @@ def _explain(file: str, item: ErrorDetails, overridden: set[str]) -> str:
         field = _find(key)
         assert field is not None, "pydantic names fields"
         about = field.description or getattr(field.annotation, "__doc__", "")
-        return f"{where}: {key} is missing: {about}"
+        return f"{where}: {key} is missing: {one_line(about)}"
     if kind == "value_error" and not key:
         # A relation between values that may come from the file and from the command line.
         origin = f"{file} with --set {' '.join(sorted(overridden))}" if overridden else file

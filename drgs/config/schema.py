@@ -75,69 +75,50 @@ Decay = Annotated[float, Field(ge=0, le=0.999999)]  # float32 has few numbers be
 class DataConfig(Section):
     """Photographs, cameras, and how to read them."""
 
-    path: PathField = Field(description="Dataset folder; relative to the configuration file.")
-    source: str = Field(
-        "", description="Source of the data, for the error message if the folder is missing."
-    )
-    type: Annotated[str, name_of(READERS, "auto")] = Field(
-        "auto",
-        description="Layout of the folder. auto: by transforms_train.json, transforms.json, or a "
-        "COLMAP model in sparse/0, sparse, colmap/sparse/0, dense/0 or beside the photographs.",
-    )
-    image_size: Count | None = Field(
-        None,
-        ge=1,
-        description="px. Wider images are scaled down to this width by area averaging; null: "
-        "1600 for photographs, as in the reference; NeRF-synthetic images keep their size.",
-    )
-    downscale: Literal[1, 2, 4, 8] | None = Field(
-        None,
-        description="COLMAP's layout: read images, images_2, images_4 or images_8; null: the "
-        "smallest of at least image_size.",
-    )
-    test_split: Literal["train", "val", "test"] | None = Field(
-        None,
-        description="Split to evaluate on, of the NeRF-synthetic layout and of splits that the "
-        "data lists; null: test if it exists, else val.",
-    )
-    test_every: Count = Field(
-        8,
-        ge=2,
-        description="nerfstudio, colmap: images 0, n, 2n, ... by file name are the test split, "
-        "unless the data lists splits.",
-    )
-    leave_out: list[str] = Field(
-        default_factory=list,
-        description="Photographs that are not used, by file name, with or without suffix and "
-        "folders: 0012, 0012.jpg, images/0012.jpg.",
-    )
-    background: ColorField = Field(
-        None,
-        description="white, black or [r, g, b] in display space: background of transparent images, "
-        "and of the splats in training, evaluation and rendering. null: white if any image is "
-        "transparent, else black.",
-    )
-    random_background: bool = Field(False, description="Use a random background in each iteration.")
-    ignore_distortion: bool = Field(False, description="Ignore lens distortion.")
-    ignore_motion: bool = Field(False, description="Ignore motion of the camera during exposure.")
-    shutter_samples: int = Field(
-        SHUTTER_SAMPLES,
-        ge=1,
-        le=MAX_SHUTTER_SAMPLES,
-        description="Number of images averaged for a moving camera with a global shutter; memory "
-        "and time are proportional.",
-    )
-    ignore_masks: bool = Field(False, description="Do not read masks.")
-    ignore_depth: bool = Field(
-        False, description="Do not read depth, as with a loss.depth_weight of 0."
-    )
-    ignore_points: bool = Field(False, description="Do not use the dataset's own point cloud.")
-    in_memory: bool | None = Field(
-        None,
-        description="Keep photographs in memory. false: on disk, from where another thread reads "
-        "them ahead; the fit has the same bytes. null: false if they take more than half of the "
-        "available memory.",
-    )
+    path: PathField
+    """Dataset folder; relative to the configuration file."""
+    source: str = ""
+    """Source of the data, for the error message if the folder is missing."""
+    type: Annotated[str, name_of(READERS, "auto")] = "auto"
+    """Layout of the folder. auto: by transforms_train.json, transforms.json, or a COLMAP model in
+    sparse/0, sparse, colmap/sparse/0, dense/0 or beside the photographs."""
+    image_size: Count | None = Field(None, ge=1)
+    """px. Wider images are scaled down to this width by area averaging; null: 1600 for photographs,
+    as in the reference; NeRF-synthetic images keep their size."""
+    downscale: Literal[1, 2, 4, 8] | None = None
+    """COLMAP's layout: read images, images_2, images_4 or images_8; null: the smallest of at least
+    image_size."""
+    test_split: Literal["train", "val", "test"] | None = None
+    """Split to evaluate on, of the NeRF-synthetic layout and of splits that the data lists; null:
+    test if it exists, else val."""
+    test_every: Count = Field(8, ge=2)
+    """nerfstudio, colmap: images 0, n, 2n, ... by file name are the test split, unless the data
+    lists splits."""
+    leave_out: list[str] = Field(default_factory=list)
+    """Photographs that are not used, by file name, with or without suffix and folders: 0012,
+    0012.jpg, images/0012.jpg."""
+    background: ColorField = None
+    """white, black or [r, g, b] in display space: background of transparent images, and of the
+    splats in training, evaluation and rendering. null: white if any image is transparent, else
+    black."""
+    random_background: bool = False
+    """Use a random background in each iteration."""
+    ignore_distortion: bool = False
+    """Ignore lens distortion."""
+    ignore_motion: bool = False
+    """Ignore motion of the camera during exposure."""
+    shutter_samples: int = Field(SHUTTER_SAMPLES, ge=1, le=MAX_SHUTTER_SAMPLES)
+    """Number of images averaged for a moving camera with a global shutter; memory and time are
+    proportional."""
+    ignore_masks: bool = False
+    """Do not read masks."""
+    ignore_depth: bool = False
+    """Do not read depth, as with a loss.depth_weight of 0."""
+    ignore_points: bool = False
+    """Do not use the dataset's own point cloud."""
+    in_memory: bool | None = None
+    """Keep photographs in memory. false: on disk, from where another thread reads them ahead; the
+    fit has the same bytes. null: false if they take more than half of the available memory."""
 
     @property
     def background_rgb(self) -> tuple[float, float, float]:
@@ -151,51 +132,31 @@ class InitConfig(Section):
 
     removed: ClassVar = {"scale": 1.0}
 
-    start: Literal["auto", "masks", "points", "sweep", "random"] = Field(
-        "auto",
-        description="Start of the Gaussians. masks: the surface of the visual hull of the images' "
-        "alpha channels, coloured from the images. points: a point cloud. sweep: points on which "
-        "neighbouring photographs agree. random: in the start box, or where the cameras look. "
-        "auto: point_cloud or half_extent if given; else masks if nearly all training images are "
-        "partly transparent; else the dataset's point cloud if it has one; else sweep where "
-        "photographs agree; else random.",
-    )
-    num_points: Count | None = Field(
-        None,
-        ge=4,
-        le=100_000_000,
-        description="Number of random points, or most points of a sweep or on the hull. null: "
-        "100,000 with the strategy adc, else two fifths of the final number.",
-    )
-    half_extent: float | None = Field(
-        None,
-        gt=0,
-        le=1e9,
-        description="Scene units: the start box is [-h, h]^3. null: the reference's 1.3 for "
-        "cameras of NeRF-synthetic scenes, else a box derived from the cameras.",
-    )
-    opacity: float = Field(0.1, ge=1e-6, le=0.999999, description="Initial opacity.")
-    point_cloud: PathField | None = Field(
-        None,
-        description="PLY with x, y, z (and red, green, blue), or a points3D file of COLMAP. null: "
-        "the dataset's own (ply_file_path, points3D), unless half_extent is given or masks are "
-        "used.",
-    )
-    gaussians: PathField | None = Field(
-        None,
-        description="File of Gaussians, in any format that is read, to go on from, as they are, in "
-        "place of points.",
-    )
-    max_point_error: float | None = Field(
-        None,
-        ge=0,
-        le=1e9,
-        description="px: drop COLMAP's points with a larger mean reprojection error, but keep "
-        "points of unknown error (-1); null: keep all.",
-    )
-    min_track_length: Count | None = Field(
-        None, ge=0, description="Drop COLMAP's points that fewer images observe; null: keep all."
-    )
+    start: Literal["auto", "masks", "points", "sweep", "random"] = "auto"
+    """Start of the Gaussians. masks: the surface of the visual hull of the images' alpha channels,
+    coloured from the images. points: a point cloud. sweep: points on which neighbouring photographs
+    agree. random: in the start box, or where the cameras look. auto: point_cloud or half_extent if
+    given; else masks if nearly all training images are partly transparent; else the dataset's point
+    cloud if it has one; else sweep where photographs agree; else random."""
+    num_points: Resolved[Count] = Field(UNRESOLVED, ge=4, le=100_000_000)
+    """Number of random points, or most points of a sweep or on the hull. null: 100,000 with the
+    strategy adc, else two fifths of the final number."""
+    half_extent: float | None = Field(None, gt=0, le=1e9)
+    """Scene units: the start box is [-h, h]^3. null: the reference's 1.3 for cameras of
+    NeRF-synthetic scenes, else a box derived from the cameras."""
+    opacity: float = Field(0.1, ge=1e-6, le=0.999999)
+    """Initial opacity."""
+    point_cloud: PathField | None = None
+    """PLY with x, y, z (and red, green, blue), or a points3D file of COLMAP. null: the dataset's
+    own (ply_file_path, points3D), unless half_extent is given or masks are used."""
+    gaussians: PathField | None = None
+    """File of Gaussians, in any format that is read, to go on from, as they are, in place of
+    points."""
+    max_point_error: float | None = Field(None, ge=0, le=1e9)
+    """px: drop COLMAP's points with a larger mean reprojection error, but keep points of unknown
+    error (-1); null: keep all."""
+    min_track_length: Count | None = Field(None, ge=0)
+    """Drop COLMAP's points that fewer images observe; null: keep all."""
 
 
 class _Model(Section):
@@ -203,21 +164,15 @@ class _Model(Section):
 
     scaled: ClassVar = ("sh_increase_every",)
 
-    sh_degree: int = Field(3, ge=0, le=3, description="Degree of the spherical harmonics.")
-    sh_increase_every: Resolved[Count] = Field(
-        LATEST_DEGREE,
-        ge=1,
-        description="Iterations between increments of the degree in use, which starts at 0. Not "
-        "given, or null: a fortieth of all iterations, at most 1000.",
-    )
-    near: Resolved[float] = Field(
-        UNRESOLVED,
-        ge=NEAR_LIMITS[0],
-        le=NEAR_LIMITS[1],
-        description="Near plane, scene units: closer means are culled. null: the reference's 0.2 "
-        "for NeRF-synthetic scenes, else about a twenty-fifth of the cameras' distance to the "
-        "point that they look at.",
-    )
+    sh_degree: int = Field(3, ge=0, le=3)
+    """Degree of the spherical harmonics."""
+    sh_increase_every: Resolved[Count] = Field(LATEST_DEGREE, ge=1)
+    """Iterations between increments of the degree in use, which starts at 0. Not given, or null: a
+    fortieth of all iterations, at most 1000."""
+    near: Resolved[float] = Field(UNRESOLVED, ge=NEAR_LIMITS[0], le=NEAR_LIMITS[1])
+    """Near plane, scene units: closer means are culled. null: the reference's 0.2 for
+    NeRF-synthetic scenes, else about a twenty-fifth of the cameras' distance to the point that they
+    look at."""
 
 
 FITTED_WITH = {"antialiased": True, "low_pass": 0.1}
@@ -246,11 +201,9 @@ _ModelWithApproximations: Any = create_model(
 class ModelConfig(_ModelWithApproximations):
     """Model of a fit and how it is rendered; with the fields of :class:`Approximations`."""
 
-    smoothing: bool = Field(
-        False,
-        description="Widen Gaussians to the resolution of the training cameras, for renderings at "
-        "other sizes (the 3D filter of Mip-Splatting, Yu et al. 2024).",
-    )
+    smoothing: bool = False
+    """Widen Gaussians to the resolution of the training cameras, for renderings at other sizes (the
+    3D filter of Mip-Splatting, Yu et al. 2024)."""
 
     @field_validator(*(name for name, d in DECLARED.items() if d.limits or d.registry))
     @classmethod
@@ -283,57 +236,38 @@ class OptimizerConfig(Section):
 
     removed: ClassVar = {"epsilon": 1e-15, "means_lr_aims": []}
 
-    means_lr: Rate = Field(3.2e-4, gt=0, description="Initial rate of the means, in scene extents.")
-    means_lr_final: Rate = Field(
-        3.2e-6, gt=0, description="Final rate of the means; the decay is exponential."
-    )
-    sh0_lr: Rate = Field(5e-3, ge=0, description="Rate of the degree-0 colour coefficients.")
-    shN_lr: Rate = Field(1e-3, ge=0, description="Rate of the higher degrees.")  # noqa: N815
-    opacities_lr: Rate = Field(
-        0.05, ge=0, description="Rate of the logit opacities (0.025 in newer references)."
-    )
-    scales_lr: Resolved[Rate] = Field(
-        UNRESOLVED,
-        ge=0,
-        description="Rate of the log scales. null: 0.02 for objects that are cut out, 0.01 for "
-        "other photographs.",
-    )
-    quats_lr: Rate = Field(2e-3, ge=0, description="Rate of the quaternions.")
-    decay: Resolved[float] = Field(
-        UNRESOLVED,
-        ge=1e-6,
-        le=1,
-        description="Ratio of final to initial rates, except for the means. null: 0.03 with the "
-        "strategy budget, 0.1 with mcmc; 1 with adc, as in the paper.",
-    )
-    decay_from: float = Field(
-        0.75,
-        ge=0,
-        lt=1,
-        description="Start of their decay, as a fraction of the iterations after coarse stages.",
-    )
-    views_per_step: int = Field(
-        1,
-        ge=1,
-        le=1000,
-        description="Batch size B: number of views, one iteration each, whose mean gradient makes "
-        "a step. Rates are multiplied by sqrt(B), and beta_1 and beta_2 raised to the power of B.",
-    )
-    views: int = Field(
-        1,
-        ge=1,
-        le=1000,
-        description="Batch size late in the fit, with unchanged rates; at most views_per_step, or "
-        "a multiple of it.",
-    )
-    views_from: float = Field(
-        0.75,
-        ge=0,
-        lt=1,
-        description="Start of that, as decay_from, but not before the population is final.",
-    )
-    beta_1: Decay = Field(0.9, description="Decay of the first moment.")
-    beta_2: Decay = Field(0.999, description="Decay of the second moment.")
+    means_lr: Rate = Field(3.2e-4, gt=0)
+    """Initial rate of the means, in scene extents."""
+    means_lr_final: Rate = Field(3.2e-6, gt=0)
+    """Final rate of the means; the decay is exponential."""
+    sh0_lr: Rate = Field(5e-3, ge=0)
+    """Rate of the degree-0 colour coefficients."""
+    shN_lr: Rate = Field(1e-3, ge=0)  # noqa: N815
+    """Rate of the higher degrees."""
+    opacities_lr: Rate = Field(0.05, ge=0)
+    """Rate of the logit opacities (0.025 in newer references)."""
+    scales_lr: Resolved[Rate] = Field(UNRESOLVED, ge=0)
+    """Rate of the log scales. null: 0.02 for objects that are cut out, 0.01 for other
+    photographs."""
+    quats_lr: Rate = Field(2e-3, ge=0)
+    """Rate of the quaternions."""
+    decay: Resolved[float] = Field(UNRESOLVED, ge=1e-6, le=1)
+    """Ratio of final to initial rates, except for the means. null: 0.03 with the strategy budget,
+    0.1 with mcmc; 1 with adc, as in the paper."""
+    decay_from: float = Field(0.75, ge=0, lt=1)
+    """Start of their decay, as a fraction of the iterations after coarse stages."""
+    views_per_step: int = Field(1, ge=1, le=1000)
+    """Batch size B: number of views, one iteration each, whose mean gradient makes a step. Rates
+    are multiplied by sqrt(B), and beta_1 and beta_2 raised to the power of B."""
+    views: int = Field(1, ge=1, le=1000)
+    """Batch size late in the fit, with unchanged rates; at most views_per_step, or a multiple of
+    it."""
+    views_from: float = Field(0.75, ge=0, lt=1)
+    """Start of that, as decay_from, but not before the population is final."""
+    beta_1: Decay = 0.9
+    """Decay of the first moment."""
+    beta_2: Decay = 0.999
+    """Decay of the second moment."""
 
 
 class LossConfig(Section):
@@ -341,41 +275,39 @@ class LossConfig(Section):
 
     removed: ClassVar = {"window": 11, "sigma": 1.5}
 
-    type: Annotated[str, name_of(LOSSES)] = Field(
-        "photometric", description="photometric, or the name of an extension."
-    )
-    dssim_weight: float = Field(0.2, ge=0, le=1, description="w; 0 disables D-SSIM.")
-    depth_weight: Weight = Field(
-        0.2,
-        description="Weight of the mean absolute error of depth, in scene extents, if the data has "
-        "depth.",
-    )
+    type: Annotated[str, name_of(LOSSES)] = "photometric"
+    """photometric, or the name of an extension."""
+    dssim_weight: float = Field(0.2, ge=0, le=1)
+    """w; 0 disables D-SSIM."""
+    depth_weight: Weight = 0.2
+    """Weight of the mean absolute error of depth, in scene extents, if the data has depth."""
 
 
 class OutputConfig(Section):
     """Output files of a fit."""
 
-    dir: PathField | None = Field(
-        None,
-        description="Output folder, relative to the configuration file; null: out/NAME in the "
-        "current folder, with the NAME of the configuration file.",
-    )
-    bake_smoothing: bool = Field(False, description="Bake model.smoothing into point_cloud.ply.")
-    save_renders: bool = Field(True, description="Write renders/<split>/*.png.")
-    report: bool = Field(
-        True, description="Write report.html, viewer.html, side_by_side/, curves.png and the orbit."
-    )
-    history_every: Count = Field(10, ge=1, description="Iterations between rows of history.csv.")
-    checkpoint_every: Count | None = Field(
-        500, ge=1, description="Iterations between checkpoints, for --resume; null: none."
-    )
+    dir: PathField | None = None
+    """Output folder, relative to the configuration file; null: out/NAME in the current folder, with
+    the NAME of the configuration file."""
+    bake_smoothing: bool = False
+    """Bake model.smoothing into point_cloud.ply."""
+    save_renders: bool = True
+    """Write renders/<split>/*.png."""
+    report: bool = True
+    """Write report.html, viewer.html, side_by_side/, curves.png and the orbit."""
+    history_every: Count = Field(10, ge=1)
+    """Iterations between rows of history.csv."""
+    checkpoint_every: Count | None = Field(500, ge=1)
+    """Iterations between checkpoints, for --resume; null: none."""
 
 
 class CoarseStage(Section):
     """Iterations with smaller images."""
 
-    until: Count = Field(ge=1, description="Last iteration of the stage.")
-    factor: int = Field(ge=2, le=64, description="Width and height are divided by this.")
+    until: Count = Field(ge=1)
+    """Last iteration of the stage."""
+    factor: int = Field(ge=2, le=64)
+    """Width and height are divided by this."""
 
 
 def _is_open(section: BaseModel, name: str) -> bool:
@@ -404,26 +336,17 @@ class FitConfig(ExtensibleSection):
     loss: LossConfig = subsection(LossConfig)
     densify: DensifyConfig = subsection(DensifyConfig)
     output: OutputConfig = subsection(OutputConfig)
-    iterations: Count = Field(
-        30_000,
-        ge=1,
-        description="Number of rendered views; each is a step unless optimizer.views_per_step is "
-        "set.",
-    )
-    stop_after: Count | None = Field(
-        None,
-        ge=1,
-        description="Last iteration, where a clock or a viewer has ended a fit that was planned "
-        "for another number of iterations. null: iterations.",
-    )
-    coarse: Resolved[list[CoarseStage]] = Field(
-        UNRESOLVED,
-        description="Stages of smaller training images, before those of full size: a list of "
-        "{until: iteration, factor: 4}. null: half the size for the first 35 % of a fit to "
-        "opaque photographs of at least 100 px, else none; none with the strategy adc, as in the "
-        "paper.",
-    )
-    seed: Count = Field(0, ge=0, description="Seed of all random numbers.")
+    iterations: Count = Field(30_000, ge=1)
+    """Number of rendered views; each is a step unless optimizer.views_per_step is set."""
+    stop_after: Count | None = Field(None, ge=1)
+    """Last iteration, where a clock or a viewer has ended a fit that was planned for another number
+    of iterations. null: iterations."""
+    coarse: Resolved[list[CoarseStage]] = UNRESOLVED
+    """Stages of smaller training images, before those of full size: a list of {until: iteration,
+    factor: 4}. null: half the size for the first 35 % of a fit to opaque photographs of at least
+    100 px, else none; none with the strategy adc, as in the paper."""
+    seed: Count = Field(0, ge=0)
+    """Seed of all random numbers."""
 
     @property
     def last_iteration(self) -> int:

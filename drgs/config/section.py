@@ -48,9 +48,18 @@ Weight = Annotated[float, Field(ge=0, le=1e6)]  # of a term of the loss, beside 
 
 
 class Section(BaseModel):
-    """A frozen section without unknown keys, infinities or silent conversions ("3" for 3)."""
+    """A frozen section without unknown keys, infinities or silent conversions ("3" for 3).
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    A string after a field describes it.
+    """
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+    )
 
     scaled: ClassVar[tuple[str, ...]] = ()
     """Names of iterations that keep their share where the number of iterations changes."""
@@ -82,6 +91,10 @@ class Section(BaseModel):
 
 
 SectionType = TypeVar("SectionType", bound=Section)
+
+
+class _SectionsOfExtensions(Section):
+    model_config = ConfigDict(use_attribute_docstrings=False)  # there is no source to read
 
 
 class ExtensibleSection(Section):
@@ -125,7 +138,7 @@ class ExtensibleSection(Section):
         others = {str(key): _to_mapping(values[key]) for key in values if key not in own}
         extensions = [extension for name in others if (extension := cls.extension(name))]
         models: dict[str, Any] = {each.name: (each.section or Section, ...) for each in extensions}
-        sections = create_model("Sections", __base__=Section, **models)
+        sections = create_model("Sections", __base__=_SectionsOfExtensions, **models)
         valid, errors = [], []
         for validate, given in ((handler, own), (sections.model_validate, others)):
             try:

@@ -65,20 +65,18 @@ class CamerasConfig(Section):
 
     scaled: ClassVar = ("start",)
 
-    optimise: bool = Field(False, description="Refine poses, focal lengths and principal points.")
-    start: Count = Field(0, ge=0, description="Last iteration before it begins.")
-    rotation_lr: CameraRate = Field(3e-4, ge=0, description="Initial rate of rotations, radians.")
-    translation_lr: CameraRate = Field(
-        3e-4, ge=0, description="Initial rate of translations, scene extents."
-    )
-    focal_lr: CameraRate = Field(
-        0.0, ge=0, description="Initial relative rate of the focal lengths, shared by all views."
-    )
-    principal_lr: CameraRate = Field(
-        0.0,
-        ge=0,
-        description="Initial rate of the principal point, image sizes, shared by all views.",
-    )
+    optimise: bool = False
+    """Refine poses, focal lengths and principal points."""
+    start: Count = Field(0, ge=0)
+    """Last iteration before it begins."""
+    rotation_lr: CameraRate = Field(3e-4, ge=0)
+    """Initial rate of rotations, radians."""
+    translation_lr: CameraRate = Field(3e-4, ge=0)
+    """Initial rate of translations, scene extents."""
+    focal_lr: CameraRate = Field(0.0, ge=0)
+    """Initial relative rate of the focal lengths, shared by all views."""
+    principal_lr: CameraRate = Field(0.0, ge=0)
+    """Initial rate of the principal point, image sizes, shared by all views."""
 
     @property
     @override

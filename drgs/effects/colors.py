@@ -51,27 +51,17 @@ IDENTITY = np.eye(3, 4).reshape(1, 12)  # the identity, row by row
 class ColorConfig(Section):
     """Exposure and white balance of each training photograph, and each camera's vignetting."""
 
-    lr: Rate | None = Field(
-        None,
-        gt=0,
-        description="Initial rate of the 3 x 4 numbers of each transform, such as 0.02; decays as "
-        "the rate of the means. null: no transforms.",
-    )
-    identity_weight: Weight = Field(
-        1.0, description="Weight of the mean squared difference from the identity."
-    )
-    vignetting_lr: Rate | None = Field(
-        None,
-        gt=0,
-        description="Initial rate of the three coefficients of each camera's vignetting, such as "
-        "0.03. null: no vignetting.",
-    )
-    response_lr: Rate | None = Field(
-        None,
-        gt=0,
-        description="Initial rate of the two numbers by which each camera's response differs from "
-        "the mean of all, such as 0.005. null: the same response.",
-    )
+    lr: Rate | None = Field(None, gt=0)
+    """Initial rate of the 3 x 4 numbers of each transform, such as 0.02; decays as the rate of the
+    means. null: no transforms."""
+    identity_weight: Weight = 1.0
+    """Weight of the mean squared difference from the identity."""
+    vignetting_lr: Rate | None = Field(None, gt=0)
+    """Initial rate of the three coefficients of each camera's vignetting, such as 0.03. null: no
+    vignetting."""
+    response_lr: Rate | None = Field(None, gt=0)
+    """Initial rate of the two numbers by which each camera's response differs from the mean of all,
+    such as 0.005. null: the same response."""
 
     @property
     @override

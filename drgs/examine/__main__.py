@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Sequence
+from functools import partial
 
 from drgs.cli.commands import CommandParser, file_or_folder, run_command
 from drgs.cli.execution import add_execution_arguments, execution_settings, select_variant
@@ -18,11 +18,6 @@ from drgs.core.environment import VARIANTS
 from drgs.datasets import load_dataset
 from drgs.datasets.folders import config_for
 from drgs.examine.examination import examine
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of ``python -m drgs.examine``."""
-    run_command(add_arguments, "python -m drgs.examine", arguments)
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -66,6 +61,8 @@ def run(args: argparse.Namespace) -> None:
             words += ["--set", each]
         print(f"fit with it: {shlex.join(words)}")
 
+
+main = partial(run_command, add_arguments, "python -m drgs.examine")
 
 if __name__ == "__main__":
     main()

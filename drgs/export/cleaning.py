@@ -10,7 +10,7 @@ from itertools import zip_longest
 import numpy as np
 
 from drgs.cameras.orbits import extent_of
-from drgs.cli.commands import CommandParser, bounded_int, finite_number
+from drgs.cli.commands import VECTOR, CommandParser, bounded_int, finite_number
 from drgs.cli.execution import add_variant_argument, execution_settings
 from drgs.core.errors import UserError, one_line
 from drgs.export.merging import take
@@ -58,9 +58,7 @@ def add_cleaning_arguments(parser: CommandParser) -> None:
         )
     add(
         "--seed-pos",
-        type=finite_number,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
+        **VECTOR,
         help="the cluster nearest to this point (default: the one with the most Gaussians)",
     )
     add(

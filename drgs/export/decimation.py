@@ -20,9 +20,9 @@ from drgs.config.schema import ModelConfig
 from drgs.core.errors import note_user
 from drgs.core.types import TensorXf
 from drgs.export.merging import merge_down
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, make_sensors
-from drgs.training.rates import TOUCH_UP_RATES
+from drgs.training.rates import RATE_KEYS, TOUCH_UP_RATES
 
 ITERATIONS = 300
 
@@ -80,6 +80,5 @@ def decimate(
 
 def _rates(extent: float) -> dict[str, float]:
     """Return the first learning rates by parameter; extent: world units."""
-    keys = ("means_lr", "quats_lr", "scales_lr", "opacities_lr", "sh0_lr", "shN_lr")
-    rates = dict(zip(PARAMETER_NAMES, (TOUCH_UP_RATES[key] for key in keys), strict=True))
+    rates = {name: TOUCH_UP_RATES[key] for name, key in RATE_KEYS.items()}
     return {**rates, "means": rates["means"] * extent}

@@ -10,13 +10,11 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from drgs.cli.commands import MAX_PORT, CommandParser, bounded_int, file_or_folder, run_command
+from drgs.cli.commands import PORT, CommandParser, file_or_folder, run_command
 from drgs.cli.ending import INTERRUPTED_STATUS
 from drgs.cli.execution import add_execution_arguments, execution_settings
 from drgs.config.changes import with_iterations
@@ -33,17 +31,9 @@ from drgs.fit.session import FitSession
 from drgs.results.folder import CONFIG, has_results, load_moved_config, load_run_config
 from drgs.training.parallel.communicator import Communicator
 
-if TYPE_CHECKING:  # imported with --view
-    from drgs.live_page.server import LocalServer
-
 MIN_EXAMINED_SECONDS = 100  # of a --budget: no short fit ends within a tenth of less
 
 LOADING_SECONDS = 1.2  # before run(), for imports; --budget includes them
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of ``python -m drgs.fit``."""
-    run_command(add_arguments, "python -m drgs.fit", arguments)
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -54,7 +44,7 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s scenes/photos.yml --data DIR --out out/mine",
         "%(prog)s --resume out/mine",
     )
-    parser.set_help_footer(describe_extensions)
+    parser.more_help = describe_extensions
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
         "config",
@@ -87,24 +77,15 @@ def add_arguments(parser: CommandParser) -> None:
         metavar="TIME",
         help="90s, 5m, 1h30m: plan a fit that ends within this time, results included",
     )
-    _add_viewing(parser)
-    add_execution_arguments(parser)
-    parser.set_defaults(run=run, is_shared=True, prog=parser.prog)
-
-
-def _add_viewing(parser: CommandParser) -> None:
     group = parser.add_argument_group("viewing", "These do not change the result.")
     group.add_argument(
         "--view",
         action="store_true",
         help="show the running fit on a web page, with buttons to pause and end it (extra: viewer)",
     )
-    group.add_argument(
-        "--view-port",
-        type=bounded_int(1, MAX_PORT),
-        metavar="N",
-        help="port of the page (default: first free port from 8080)",
-    )
+    group.add_argument("--view-port", **PORT)
+    add_execution_arguments(parser)
+    parser.set_defaults(run=run, is_shared=True, prog=parser.prog)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -119,13 +100,15 @@ def run(args: argparse.Namespace) -> None:
         if not comm.is_root:
             session.run()
             return
-        server = blocks.enter_context(page_server(args))
+        if args.view:
+            serve_live_view(session, args.view_port, blocks)
+        elif args.view_port is not None:
+            raise UserError("--view-port: needs --view")
         session.config, out = read_inputs(args)
         session.folder = FitFolder(out, args.command, args.resume is not None, args.overwrite)
         if args.config is not None and args.config.is_dir():
             choose_effects(session, session.config, session.folder)
         session.uses_terminal = True
-        session.on_start = partial(add_live_view, server)
         finished = session.run()
     if not finished:
         print(f"stopped; continue with: {args.prog} --resume {out}")
@@ -158,28 +141,21 @@ def communicator(args: argparse.Namespace) -> Communicator:
     return comm
 
 
-def add_live_view(server: LocalServer | None, session: FitSession) -> None:
-    """Add an observer for the server's page, if there is one."""
-    if server is not None:
-        from drgs.fit.live_view import watch
-        from drgs.live_page.server import url
+def serve_live_view(session: FitSession, port: int | None, blocks: ExitStack) -> None:
+    """Serve a page until ``blocks`` ends, which observes the fit from its start."""
+    require_module("viser", "viewer", "--view")
+    from drgs.live_page.server import run_server, url
 
-        trainer = session.trainer
-        viewer, session.continues = watch(server, trainer, trainer.dataset, session.continues)
+    server = blocks.enter_context(run_server(port, "--view-port"))
+
+    def observe(session: FitSession) -> None:
+        from drgs.fit.live_view import watch
+
+        viewer, session.continues = watch(server, session.trainer, session.continues)
         session.observers.append(viewer)
         print(f"live view: {url(server)}", flush=True)
 
-
-def page_server(args: argparse.Namespace) -> AbstractContextManager[LocalServer | None]:
-    """Return the server of ``--view``'s page; None without it."""
-    if not args.view:
-        if args.view_port is not None:
-            raise UserError("--view-port: needs --view")
-        return nullcontext()
-    require_module("viser", "viewer", "--view")
-    from drgs.live_page.server import run_server
-
-    return run_server(args.view_port, "--view-port")
+    session.on_start = observe
 
 
 def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:
@@ -212,6 +188,8 @@ def read_inputs(args: argparse.Namespace) -> tuple[FitConfig, Path]:
         config, name = load_config(args.config, overrides), args.config.stem
     return config, config.output.dir or Path("out") / name
 
+
+main = partial(run_command, add_arguments, "python -m drgs.fit")
 
 if __name__ == "__main__":
     main()

@@ -32,6 +32,7 @@ from drgs.fit.inputs import share_inputs
 from drgs.fit.loop import Continues
 from drgs.fit.memory import room_for_targets
 from drgs.fit.report import seconds_of_results
+from drgs.fit.viewers_fit import TIME_SHARE
 from drgs.gaussians.parameters import Gaussians
 from drgs.training.contracts import NO_PARTS, GivenParts
 from drgs.training.parallel.communicator import Communicator
@@ -297,8 +298,6 @@ def plan_fit(
         end -= images
     end -= results.measuring
     if not config.model.approximations.is_default:
-        from drgs.fit.viewers_fit import TIME_SHARE
-
         end -= results.viewers
         end -= TIME_SHARE * max(0.0, end - time.perf_counter())
     side = min(min(view.width, view.height) for view in dataset.train)

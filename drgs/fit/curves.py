@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib import rc_context
 
+from drgs.fit.loop import History
 from drgs.io.figures import new_figure, write_figure
-from drgs.results.history import FitHistory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,7 +44,7 @@ class Panel:
     others: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # steps
 
 
-def panels_of(history: FitHistory) -> list[Panel]:
+def panels_of(history: History) -> list[Panel]:
     """Return the six curves."""
 
     def column(name: str) -> np.ndarray:
@@ -68,7 +68,7 @@ def panels_of(history: FitHistory) -> list[Panel]:
     ]
 
 
-def _changes_so_far(history: FitHistory) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _changes_so_far(history: History) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return iterations and cumulative numbers of changes by kind, without those of zero."""
     changes, curves = history.density, {}
     x = [0, *(change.iteration for change in changes)]
@@ -81,7 +81,7 @@ def _changes_so_far(history: FitHistory) -> dict[str, tuple[np.ndarray, np.ndarr
     return curves
 
 
-def write_curves(path: Path, history: FitHistory) -> None:
+def write_curves(path: Path, history: History) -> None:
     """Write an image of all curves."""
     figure = new_figure(11, 6, paper=PAPER)
     _fix_margins(figure)

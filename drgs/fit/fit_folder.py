@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -21,13 +21,14 @@ from drgs.config.schema import FitConfig
 from drgs.core.environment import processor
 from drgs.core.errors import UserError
 from drgs.core.files import atomic_path, write_json
-from drgs.core.folders import sole_writer
+from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
-from drgs.effects.base import ChosenEffects
+from drgs.effects.smoothing import bake_smoothing
 from drgs.fit.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.fit.inputs import versions
 from drgs.fit.loop import History
 from drgs.fit.report import MAX_PICTURES, FitImages, write_images, write_results
+from drgs.fit.viewers_fit import ForViewers
 from drgs.gaussians.parameters import Gaussians
 from drgs.results import folder
 from drgs.results.history import HistoryRow, write_density, write_history
@@ -35,9 +36,6 @@ from drgs.results.html_viewer import DisplaySettings, shows_as_fitted
 from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
 from drgs.results.refined_cameras import write_views
 from drgs.training.trainer import Trainer
-
-if TYPE_CHECKING:  # imported where it is needed
-    from drgs.fit.viewers_fit import ForViewers
 
 
 @dataclass(eq=False)
@@ -116,15 +114,10 @@ class FitFolder:
         else:
             folder.claim_output_folder(self.path, config, images)
 
-    def write_plan(self, text: str) -> None:
-        """Write the plan and its reasons."""
-        with atomic_path(self.path / folder.BUDGET_PLAN) as temporary:
+    def write_text(self, name: str, text: str) -> None:
+        """Write a plan, or what an examination chose, with the reasons."""
+        with atomic_path(self.path / name) as temporary:
             temporary.write_text(text)
-
-    def write_examination(self, examination: ChosenEffects) -> None:
-        """Write what was chosen, and why."""
-        with atomic_path(self.path / folder.EXAMINATION) as temporary:
-            temporary.write_text(examination.to_json())
 
     def with_examination(self, config: FitConfig) -> FitConfig | None:
         """Return the configuration with what an examination chose for the run in the folder.
@@ -188,7 +181,10 @@ class FitFolder:
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
             metrics["viewers"] = SplitMetrics(**vars(quality), split=split)
         if output.report:
-            shown = gaussians_on_page(gaussians, approximations, other)
+            if other is not None and not shows_as_fitted(approximations):
+                shown = DisplaySettings(other, Approximations())
+            else:
+                shown = DisplaySettings(bake_smoothing(gaussians), approximations)
             scene = trainer.full_scene()
             assert scene is not None, "rank 0 writes the results"
             fitted = FitImages(scene, gaussians, render, shown)
@@ -243,7 +239,7 @@ class FitFolder:
         if metrics is not None:
             write_json(self.path / folder.METRICS, metrics, indent=2)
         remove_checkpoint(self.path)
-        folder.seal_run(self.path)
+        FolderRecord(self.path, folder.COMMAND).seal()
 
 
 def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
@@ -253,21 +249,4 @@ def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
     ``output.bake_smoothing``.
     """
     gaussians = replace(gaussians, rendered_with=config.model.approximations.non_default or None)
-    return _remove_filter(gaussians) if config.output.bake_smoothing else gaussians
-
-
-def gaussians_on_page(
-    gaussians: Gaussians, approximations: Approximations, for_viewers: Gaussians | None
-) -> DisplaySettings:
-    """Return the Gaussians of ``viewer.html``: those for viewers if it cannot render the fit's."""
-    if for_viewers is not None and not shows_as_fitted(approximations):
-        return DisplaySettings(for_viewers, Approximations())
-    return DisplaySettings(_remove_filter(gaussians), approximations)
-
-
-def _remove_filter(gaussians: Gaussians) -> Gaussians:
-    if gaussians.smoothing is None:
-        return gaussians
-    from drgs.effects.smoothing import bake_smoothing
-
-    return bake_smoothing(gaussians)
+    return bake_smoothing(gaussians) if config.output.bake_smoothing else gaussians

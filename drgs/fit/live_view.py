@@ -13,7 +13,6 @@ import drjit as dr
 import numpy as np
 from typing_extensions import override
 
-from drgs.datasets.types import Dataset
 from drgs.fit.loop import Continues, History, Iteration, Observer, exponential_mean
 from drgs.live_page.frames import LiveScene
 from drgs.live_page.page import Page, StartView, event_handler
@@ -51,9 +50,8 @@ def unless_ended(continues: Continues, requests: RenderRequests) -> Continues:
 class TrainingViewer(Observer):
     """Serves viewer clients during a fit: see :class:`drgs.fit.loop.Observer`."""
 
-    def __init__(self, requests: RenderRequests, page: TrainingPage, dataset: Dataset) -> None:
+    def __init__(self, requests: RenderRequests, page: TrainingPage) -> None:
         self._requests, self._page = requests, page
-        self._background = dataset.background
         self._scheduler = RenderScheduler(
             requests, page.show, page.refuse, lambda s: max(REFRESH_SECONDS, s / REFRESH_SHARE)
         )
@@ -62,10 +60,9 @@ class TrainingViewer(Observer):
         self._fit_s = 0.0  # seconds that the fit's own kernels took here
 
     @override
-    def after_iteration(
-        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
-    ) -> None:
+    def after_iteration(self, done: Iteration, stops: Callable[[], bool]) -> None:
         """Render due frames, and wait while the fit is paused; its clock stops meanwhile."""
+        trainer, history = done.trainer, done.history
         start, self._fit_s = time.perf_counter(), 0.0
         now = time.monotonic()
         is_due = self._requests.pending and now - self._progress_at >= PROGRESS_SECONDS
@@ -92,7 +89,8 @@ class TrainingViewer(Observer):
             trainer.sync_scene()
             gaussians = dr.detach(trainer.integrator.gaussians)
             model, degree = trainer.config.model, trainer.sh_degree
-            self._scene = LiveScene(gaussians, model, self._background, sh_degree=degree)
+            background = trainer.dataset.background
+            self._scene = LiveScene(gaussians, model, background, sh_degree=degree)
         return self._scene
 
 
@@ -180,14 +178,14 @@ class TrainingPage(Page):
 
 
 def watch(
-    server: viser.ViserServer, trainer: Trainer, dataset: Dataset, continues: Continues
+    server: viser.ViserServer, trainer: Trainer, continues: Continues
 ) -> tuple[TrainingViewer, Continues]:
     """Show a fit on the server's page; return the observer that serves it, and its end."""
-    requests = RenderRequests()
-    start = StartView.from_views(dataset.train).move_back(START_DISTANCE_FACTOR)
+    requests, train = RenderRequests(), trainer.dataset.train
+    start = StartView.from_views(train).move_back(START_DISTANCE_FACTOR)
     page = TrainingPage(server, requests, start, trainer.config.model.approximations)
-    page.add_cameras(dataset.train, visible=True)
-    return TrainingViewer(requests, page, dataset), unless_ended(continues, requests)
+    page.add_cameras(train, visible=True)
+    return TrainingViewer(requests, page), unless_ended(continues, requests)
 
 
 def psnr_curves(rows: Sequence[HistoryRow]) -> list[Curve]:

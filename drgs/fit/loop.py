@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import accumulate
 from typing import Protocol
 
@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from drgs.config.changes import with_changes
 from drgs.datasets.types import View, evenly_spaced
-from drgs.results.history import DENSITY_COLUMNS, DensityReport, DensityRow, FitHistory, HistoryRow
+from drgs.results.history import DENSITY_COLUMNS, DensityReport, DensityRow, HistoryRow
 from drgs.results.metrics import psnr
 from drgs.training.trainer import StepReport, Trainer
 
@@ -26,24 +26,24 @@ NUM_MEASUREMENTS, MIN_ITERATIONS_BETWEEN = 10, 100
 """About how often a fit is measured, and the fewest iterations between two measurements."""
 
 
-class History(FitHistory):
+@dataclass(eq=False)
+class History:
     """The tables of a fit that runs, and the time spent, also before an interruption."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._before = 0.0
-        self._started = time.perf_counter()
+    rows: list[HistoryRow] = field(default_factory=list)
+    density: list[DensityRow] = field(default_factory=list)
+    _before: float = 0.0
+    _started: float = field(default_factory=lambda: time.perf_counter())
 
     @staticmethod
     def from_arrays(rows: np.ndarray, density: np.ndarray, wall_s: float) -> History:
         """Return the inverse of :meth:`arrays`; the clock continues from ``wall_s``."""
-        history = History()
+        history = History(_before=wall_s)
         for i, loss, view_psnr, n, lr, at, test_psnr in rows:
             measured = None if math.isnan(test_psnr) else float(test_psnr)
             history.rows.append(HistoryRow(int(i), loss, view_psnr, int(n), lr, at, measured))
         for row in density.tolist():
             history.density.append(DensityRow(**dict(zip(DENSITY_COLUMNS, row, strict=True))))
-        history._before = wall_s
         return history
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
@@ -75,10 +75,6 @@ class History(FitHistory):
         """Write down a change of the population; waits for nothing."""
         self.density.append(DensityRow(**asdict(report), iteration=iteration))
 
-    def add_test_psnr(self, psnr: float) -> None:
-        """Record the PSNR of the last row's Gaussians on test views, dB."""
-        self.rows[-1] = replace(self.rows[-1], test_psnr=psnr)
-
     def leave_out(self, seconds: float) -> None:
         """Subtract time since the last row that was no part of the fit."""
         self._started += seconds
@@ -107,6 +103,8 @@ def until_planned_end(trainer: Trainer) -> bool:
 class Iteration:
     """A finished step, of one iteration or several."""
 
+    trainer: Trainer
+    history: History
     report: StepReport
     row: HistoryRow | None  # of the history, where this iteration is written down
     is_last: bool
@@ -115,10 +113,8 @@ class Iteration:
 class Observer(Protocol):
     """An observer of a running fit, without influence on its bytes."""
 
-    def after_iteration(
-        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
-    ) -> None:
-        """Called after an iteration, by the thread that fits; history: with its row, if any.
+    def after_iteration(self, done: Iteration, stops: Callable[[], bool]) -> None:
+        """Called after an iteration, by the thread that fits.
 
         stops: whether the fit is to stop at once; an observer that waits has to call it.
         """
@@ -142,7 +138,7 @@ def iterations(
         if is_last or report.passes(trainer.config.output.history_every):
             row = history.add(report)
             trainer.check_iterations()  # reading the row has waited for the device
-        yield Iteration(report, row, is_last)
+        yield Iteration(trainer, history, report, row, is_last)
 
 
 def _is_last(trainer: Trainer, continues: Continues) -> bool:
@@ -161,13 +157,11 @@ class HeldOutQuality(Observer):
         self._views = evenly_spaced(views, MAX_MEASURED_VIEWS)
 
     @override
-    def after_iteration(
-        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
-    ) -> None:
-        config = trainer.config
+    def after_iteration(self, done: Iteration, stops: Callable[[], bool]) -> None:
+        config = done.trainer.config
         is_row = done.row is not None and config.output.report
-        if is_row and (done.is_last or measurement_is_due(history.rows, config.iterations)):
-            self.measure(trainer, history)
+        if is_row and (done.is_last or measurement_is_due(done.history.rows, config.iterations)):
+            self.measure(done.trainer, done.history)
 
     def measure(self, trainer: Trainer, history: History) -> None:
         """Add the mean PSNR to the last row of the history; its clock is paused meanwhile."""
@@ -176,13 +170,13 @@ class HeldOutQuality(Observer):
         pairs = zip(trainer.images(self._views), self._views, strict=True)
         scores = [psnr(image, view.image, view.mask) for image, view in pairs]
         mean = np.mean(scores) if scores else np.nan
-        history.add_test_psnr(float(trainer.comm.broadcast_numbers(mean)))
+        test_psnr = float(trainer.comm.broadcast_numbers(mean))
+        history.rows[-1] = replace(history.rows[-1], test_psnr=test_psnr)
         history.leave_out(time.perf_counter() - start)
 
 
 def measurement_is_due(rows: Sequence[HistoryRow], iterations: int) -> bool:
     """Return whether the last of ``rows`` is to be measured; iterations: of the whole fit."""
     before = max((row.iteration for row in rows if row.test_psnr is not None), default=0)
-    return rows[-1].iteration - before >= max(
-        MIN_ITERATIONS_BETWEEN, iterations // NUM_MEASUREMENTS
-    )
+    every = max(MIN_ITERATIONS_BETWEEN, iterations // NUM_MEASUREMENTS)
+    return rows[-1].iteration - before >= every

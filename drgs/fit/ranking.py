@@ -9,7 +9,7 @@ import numpy as np
 
 from drgs.datasets.images import downscale, smaller_view, with_arrays
 from drgs.datasets.types import LazyImage, View
-from drgs.results.alignment import align
+from drgs.results.alignment import Alignment, align
 from drgs.results.metrics import map_ahead, psnr
 
 WIDTH_PX = 135  # about: of photographs and renderings that are registered and shown
@@ -56,21 +56,15 @@ def rank_photographs(
         factor = max(1, round(view.width / WIDTH_PX))
         small = with_arrays(smaller_view(view, factor))
         image = downscale(image, small.width)
-        hint = _hint_at(small, image, factor, background, bool(ranked[place].psnr < limit))
+        is_outlier = bool(ranked[place].psnr < limit)
+        hint = _hint_at(align(small, image, background), factor, is_outlier)
         images = np.concatenate([np.asarray(small.image), image], axis=1)
         ranked[place] = replace(ranked[place], hint=hint, images=images)
     return ranked
 
 
-def _hint_at(
-    view: View,
-    image: np.ndarray,
-    factor: int,
-    background: tuple[float, float, float],
-    is_outlier: bool,
-) -> str:
+def _hint_at(found: Alignment, factor: int, is_outlier: bool) -> str:
     """Return how a photograph differs from its rendering; "": as others do."""
-    found = align(view, image, background)
     hints = []
     if np.abs(found.gains).max() > MIN_GAIN:
         gains = ", ".join(f"{gain:+.0%}" for gain in found.gains)

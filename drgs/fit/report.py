@@ -27,6 +27,7 @@ from drgs.core.files import atomic_path
 from drgs.datasets.images import downscale
 from drgs.datasets.types import Dataset, View, evenly_spaced
 from drgs.fit.curves import NUM_PANELS, Panel, draw_curve, panels_of, write_curves
+from drgs.fit.loop import History
 from drgs.fit.ranking import RankedPhotograph, Render, rank_photographs
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import render_views
@@ -41,7 +42,7 @@ from drgs.results.folder import (
     SIDE_BY_SIDE,
     VIEWER,
 )
-from drgs.results.history import FitHistory, summarize_density
+from drgs.results.history import summarize_density
 from drgs.results.html_viewer import DisplaySettings, seconds_of_page, write_viewer
 from drgs.results.metrics import FitMetrics, map_ahead, psnr, ssim
 
@@ -103,7 +104,7 @@ def write_results(
     dataset: Dataset,
     fitted: FitImages,
     scores: Sequence[Score],
-    history: FitHistory,
+    history: History,
     metrics: FitMetrics,
 ) -> None:
     """Write ``curves.png``, ``orbit.webp``, ``viewer.html``, ``report.html``; scores: by view."""
@@ -195,7 +196,7 @@ def write_report(
     dataset: Dataset,
     render: Render,
     scores: Sequence[Score],
-    history: FitHistory,
+    history: History,
     metrics: FitMetrics,
     orbit: bytes,
 ) -> None:
@@ -207,7 +208,7 @@ def write_report(
     page = Template(template).substitute(
         title=html.escape(title),
         description=html.escape(dataset.description),
-        tiles="".join(_tile(*tile) for tile in _headline(metrics)),
+        tiles=_headline(metrics),
         facts="".join(_row(*fact) for fact in _facts(dataset, metrics, history)),
         split=html.escape(dataset.test_split),
         orbit=_uri("image/webp", orbit),
@@ -242,18 +243,21 @@ def choose_views(scores: Sequence[float]) -> list[tuple[str, int]]:
     return [("Best", order[0]), ("Median", order[len(order) // 2]), ("Worst", order[-1])]
 
 
-def _headline(metrics: FitMetrics) -> list[tuple[str, str, str]]:
-    """Return (value, unit, label) of the headline numbers."""
-    test = metrics["test"]
-    return [
-        (f"{test['psnr']:.2f}", "dB", f"PSNR, mean of {test['num_views']} {test['split']} views"),
-        (f"{test['ssim']:.4f}", "", "SSIM"),
-        (f"{metrics['num_gaussians']:,}", "", "Gaussians"),
-        (duration(metrics["wall_s"]), "", f"for {metrics['iterations']:,} iterations"),
-    ]
+def _headline(metrics: FitMetrics) -> str:
+    test, unit = metrics["test"], " <small>dB</small>"
+    numbers = {
+        f"PSNR, mean of {test['num_views']} {test['split']} views": f"{test['psnr']:.2f}{unit}",
+        "SSIM": f"{test['ssim']:.4f}",
+        "Gaussians": f"{metrics['num_gaussians']:,}",
+        f"for {metrics['iterations']:,} iterations": duration(metrics["wall_s"]),
+    }
+    return "".join(
+        f"<div><strong>{value}</strong><span>{html.escape(label)}</span></div>"
+        for label, value in numbers.items()
+    )
 
 
-def _facts(dataset: Dataset, metrics: FitMetrics, history: FitHistory) -> list[tuple[str, str]]:
+def _facts(dataset: Dataset, metrics: FitMetrics, history: History) -> list[tuple[str, str]]:
     versions = metrics["versions"]
     names = {"mitsuba": "Mitsuba", "drjit": "Dr.Jit", "numpy": "NumPy", "python": "Python"}
     names["llvm"] = "LLVM"
@@ -325,13 +329,6 @@ def _truth(dataset: Dataset) -> str:
 def _curve(panel: Panel) -> str:
     source = _uri("image/svg+xml", draw_curve(panel).encode())
     return f'<img alt="{panel.title} over {panel.x_label}" src="{source}">'
-
-
-def _tile(value: str, unit: str, label: str) -> str:
-    unit = f" <small>{unit}</small>" if unit else ""
-    return (
-        f"<div><strong>{html.escape(value)}{unit}</strong><span>{html.escape(label)}</span></div>"
-    )
 
 
 def _row(name: str, value: str) -> str:

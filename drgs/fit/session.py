@@ -12,7 +12,6 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING
 
 import mitsuba as mi
 from typing_extensions import override
@@ -48,11 +47,13 @@ from drgs.fit.loop import (
 )
 from drgs.fit.memory import room_for_targets
 from drgs.fit.summary import summary_of_fit
+from drgs.fit.viewers_fit import ForViewers, for_viewers, num_iterations
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import description_of_start, gaussians_at, start_of
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import format_effects
+from drgs.results.folder import BUDGET_PLAN, EXAMINATION
 from drgs.results.history import HistoryRow
 from drgs.training.contracts import NO_PARTS, GivenParts
 from drgs.training.density.strategy import DensityStrategy
@@ -60,9 +61,6 @@ from drgs.training.finite_checks import NonFiniteError
 from drgs.training.losses import Loss, LossTerm
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import StepReport, Trainer
-
-if TYPE_CHECKING:  # imported where it is needed
-    from drgs.fit.viewers_fit import ForViewers
 
 
 class ProgressLine(Observer):
@@ -73,14 +71,12 @@ class ProgressLine(Observer):
         self._psnr: float | None = None  # dB, smooth
 
     @override
-    def after_iteration(
-        self, trainer: Trainer, history: History, done: Iteration, stops: Callable[[], bool]
-    ) -> None:
+    def after_iteration(self, done: Iteration, stops: Callable[[], bool]) -> None:
         if (row := done.row) is not None:
             self._psnr = smoother(self._psnr, row.psnr)
             status = f"loss {row.loss:.4f}  PSNR {self._psnr:5.2f} dB  "
             status += f"Gaussians {row.num_gaussians:,}"
-            total = row.iteration if done.is_last else trainer.config.last_iteration
+            total = row.iteration if done.is_last else done.trainer.config.last_iteration
             self._progress.update(row.iteration, max(row.iteration, total), status)
 
 
@@ -128,11 +124,12 @@ class FitSession:
             if folder is not None:
                 folder.claim(*self._inputs)
                 if self.examination is not None:
-                    folder.write_examination(self.examination)
+                    folder.write_text(EXAMINATION, self.examination.to_json())
             if plan is not None:
                 self.continues = deadline(plan.end, self.comm)
                 if folder is not None and self.budget is not None:
-                    folder.write_plan(f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n")
+                    text = f"--budget {self.budget.seconds:g}s\n{plan.reasons}\n"
+                    folder.write_text(BUDGET_PLAN, text)
             self.on_start(self)
             try:
                 if not self.iterate():
@@ -290,7 +287,7 @@ class FitSession:
             for done in iterations(trainer, self.history, self.continues):
                 self.check_ranges()
                 for observer in observers:
-                    observer.after_iteration(trainer, self.history, done, lambda: stop.requested)
+                    observer.after_iteration(done, lambda: stop.requested)
                 stops = bool(comm.broadcast_numbers(stop.requested))
                 every = trainer.config.output.checkpoint_every
                 is_due = done.is_last or (every is not None and done.report.passes(every))
@@ -318,19 +315,16 @@ class FitSession:
             )
         release_unused_memory()  # encoding the orbit's frames takes as much as iterations do
         trainer.full_scene()  # gathered from all ranks
-        for_viewers = None
+        others = None
         if not trainer.config.model.approximations.is_default:
-            for_viewers = self._fit_for_viewers(gaussians)
+            others = self._fit_for_viewers(gaussians)
         if self.folder is not None:
-            metrics = self.folder.write_results(
-                trainer, self.history, gaussians, for_viewers, wall_s
-            )
+            results = trainer, self.history, gaussians, others, wall_s
+            metrics = self.folder.write_results(*results)
             self._print(self.folder.describe(metrics))
 
     def _fit_for_viewers(self, gaussians: Gaussians) -> ForViewers:
         """Return Gaussians for other viewers; the trainer is released, and renders the fit's."""
-        from drgs.fit.viewers_fit import for_viewers, num_iterations
-
         if not self.uses_terminal:
             return for_viewers(self.trainer, gaussians)
         total = num_iterations(self.trainer.config)

@@ -9,16 +9,15 @@ import numpy as np
 from drgs.cameras.viewpoints import focus_of
 from drgs.config.changes import with_changes
 from drgs.config.extensions import STRATEGIES
-from drgs.config.schema import NAMED_COLORS, REFERENCE_NEAR, FitConfig
+from drgs.config.schema import NAMED_COLORS, NEAR_LIMITS, REFERENCE_NEAR, FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.types import Dataset
+from drgs.initialization.visual_hull import MAX_EMPTY_ALPHA, MIN_TRANSPARENT_SHARE
 
 NEAR_SHARE = 0.04
 """The near plane is this share of the cameras' distance to their focus, rounded to one digit: the
 reference's 0.2 for NeRF-synthetic scenes, whose distance is 4.03, and for distances of 4 to 6,
 which photographs often have in COLMAP's unit of length."""
-
-NEAR_RANGE = (1e-9, 1e9)  # scene units that a configuration accepts
 
 MAX_NEAR_SHARE = 0.5  # of that distance: a farther near plane would cut into the scene
 
@@ -57,7 +56,7 @@ def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
         changes["data.background"] = names.get(background, background)
     distance = _viewing_distance(dataset)
     if config.model.near is None:
-        near = float(f"{np.clip(NEAR_SHARE * distance, *NEAR_RANGE):.1g}")
+        near = float(f"{np.clip(NEAR_SHARE * distance, *NEAR_LIMITS):.1g}")
         changes["model.near"] = near if count else REFERENCE_NEAR
     elif count and config.model.near > MAX_NEAR_SHARE * distance:
         raise UserError(
@@ -105,8 +104,6 @@ def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
 
 def _is_cut_out(dataset: Dataset) -> bool:
     """Return whether most of some images are transparent in part."""
-    from drgs.initialization.visual_hull import MAX_EMPTY_ALPHA, MIN_TRANSPARENT_SHARE
-
     some = dataset.train[:: -(-len(dataset.train) // NUM_ALPHA_VIEWS) or 1]
     alphas = (np.asarray(view.alpha) for view in some if view.alpha is not None)
     shares = [float(np.mean(alpha <= MAX_EMPTY_ALPHA)) for alpha in alphas]  # one at a time

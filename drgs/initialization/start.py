@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -31,11 +30,16 @@ from drgs.initialization.start_box import (
     points_in_view,
     start_box_of,
 )
+from drgs.initialization.visual_hull import (
+    Silhouette,
+    are_masks,
+    hull_points,
+    num_transparent,
+    silhouettes_of,
+)
+from drgs.io.colmap import read_points3d
 from drgs.io.formats import format_to_read
 from drgs.io.ply import read_points
-
-if TYPE_CHECKING:
-    from drgs.initialization.visual_hull import Silhouette
 
 MIN_SPACING = 2.5e-4
 """Smallest first scale, for points that coincide, as a share of the median distance of points from
@@ -123,8 +127,6 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
         return _given_start(config, dataset, init.gaussians)
     is_open = init.start == "auto" and init.point_cloud is None and init.half_extent is None
     if init.start == "masks" or (is_open and any(v.alpha is not None for v in dataset.train)):
-        from drgs.initialization.visual_hull import are_masks, num_transparent, silhouettes_of
-
         silhouettes = silhouettes_of(dataset.train)
         if are_masks(silhouettes, dataset.train):
             if (start := _hull_start(config, dataset, silhouettes)) is not None:
@@ -182,15 +184,13 @@ def _hull_start(
     config: FitConfig, dataset: Dataset, silhouettes: Sequence[Silhouette]
 ) -> Start | None:
     """Return points on the visual hull of the masks; None: it is empty."""
-    from drgs.initialization.visual_hull import hull_points
-
     try:
         box = start_box_of(config.init, dataset) or focus_box(dataset.train)
     except UserError:
         if config.init.half_extent is not None:
             raise
         return None
-    means = hull_points(silhouettes, box, _num_points(config.init), config.seed)
+    means = hull_points(silhouettes, box, config.init.num_points, config.seed)
     if len(means) <= NUM_NEIGHBOURS:
         return None
     what = f"{len(means):,} points on the hull of {len(silhouettes)} masks"
@@ -240,8 +240,6 @@ def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray |
             raise UserError(f"{cloud}: holds Gaussians, no points; set init.gaussians to it")
         positions, colors = read_points(cloud)
         return positions, colors, len(positions)
-    from drgs.io.colmap import read_points3d
-
     points = read_points3d(cloud)
     kept = np.ones(len(points.errors), bool)
     if init.max_point_error is not None:
@@ -259,11 +257,6 @@ def _read_cloud(init: InitConfig, cloud: Path) -> tuple[np.ndarray, np.ndarray |
     return positions, colors / np.float32(255), len(kept)
 
 
-def _num_points(init: InitConfig) -> int:
-    assert init.num_points is not None, "resolve_defaults sets it"
-    return init.num_points
-
-
 def _swept_start(config: FitConfig, dataset: Dataset) -> Start | None:
     """Return points of a plane sweep; None: there are few, or the layout has a box of its own."""
     if start_box_of(config.init, dataset) is not None and config.init.start == "auto":
@@ -273,7 +266,7 @@ def _swept_start(config: FitConfig, dataset: Dataset) -> Start | None:
     means, colors = swept_points(dataset.train)
     if len(means) >= MIN_SWEPT:
         chosen = np.random.default_rng(config.seed).permutation(len(means))
-        chosen = np.sort(chosen[: _num_points(config.init)])
+        chosen = np.sort(chosen[: config.init.num_points])
         what = f"{len(chosen):,} of {len(means):,} points of a plane sweep between photographs"
         return Start(means[chosen].astype(np.float32), colors[chosen], what)
     if config.init.start == "sweep":
@@ -285,7 +278,7 @@ def _swept_start(config: FitConfig, dataset: Dataset) -> Start | None:
 
 
 def _random_start(config: FitConfig, dataset: Dataset) -> Start:
-    num_points, rng = _num_points(config.init), np.random.default_rng(config.seed)
+    num_points, rng = config.init.num_points, np.random.default_rng(config.seed)
     what, box = f"{num_points:,} random points", start_box_of(config.init, dataset)
     if box is not None:
         return Start(box.points(num_points, rng), None, f"{what} in {box}")

@@ -72,10 +72,14 @@ class FrameRequest:
         width, height = (max(1, round(side / divisor)) for side in (self.width, self.height))
         return replace(self, width=width, height=height)
 
+    @property
+    def viewpoint(self) -> Viewpoint:
+        """The pinhole camera of this view."""
+        return self.camera.viewpoint(self.width, self.height)
+
     def sensor(self) -> mi.Sensor:
         """Return Mitsuba's sensor, whose film is RGB with a box filter."""
-        make_sensor = VIEWER_LENSES[self.lens].make_sensor
-        return make_sensor(self.camera, self.width, self.height, **self.lens_parameters)
+        return VIEWER_LENSES[self.lens].make_sensor(self, **self.lens_parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,65 +212,54 @@ def over_backdrop(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 class ViewerLens:
     """A lens that viewer clients can choose."""
 
-    make_sensor: Callable[..., mi.Sensor]  # (ViewerCamera, width, height (px), **parameters)
+    make_sensor: Callable[..., mi.Sensor]  # (FrameRequest, **parameters)
     parameters: tuple[str, ...] = ()  # names of those with a slider
     most_accurate: str = "exact"  # projection; ``exact`` needs undistorted rays through one point
 
 
-def _pinhole(camera: ViewerCamera, width: int, height: int) -> mi.Sensor:
-    return make_sensors([camera.viewpoint(width, height)])[0]
+def _pinhole(request: FrameRequest) -> mi.Sensor:
+    return make_sensors([request.viewpoint])[0]
 
 
-def _opencv(camera: ViewerCamera, width: int, height: int, **coefficients: float) -> mi.Sensor:
+def _opencv(request: FrameRequest, **coefficients: float) -> mi.Sensor:
     lens = LENSES.get("opencv").value.from_coefficients(**coefficients)
-    return make_sensors([replace(camera.viewpoint(width, height), lens=lens)])[0]
+    return make_sensors([replace(request.viewpoint, lens=lens)])[0]
 
 
-def _fisheye(camera: ViewerCamera, width: int, height: int, **coefficients: float) -> mi.Sensor:
+def _fisheye(request: FrameRequest, **coefficients: float) -> mi.Sensor:
     """Return a sensor whose undistorted film height spans the field of view."""
     lens = LENSES.get("fisheye").value.from_coefficients(**coefficients)
-    focal = height / math.radians(camera.fov)
-    view = replace(camera.viewpoint(width, height), fx=focal, fy=focal, lens=lens)
-    return make_sensors([view])[0]
+    focal = request.height / math.radians(request.camera.fov)
+    return make_sensors([replace(request.viewpoint, fx=focal, fy=focal, lens=lens)])[0]
 
 
-def _orthographic(camera: ViewerCamera, width: int, height: int) -> mi.Sensor:
+def _orthographic(request: FrameRequest) -> mi.Sensor:
+    camera = request.camera
     half_height = camera.distance * math.tan(math.radians(camera.fov) / 2)
-    half_width = half_height * width / height
+    half_width = half_height * request.width / request.height
     # Mitsuba's film is two sensor units wide.
     scale = np.diag([half_width, half_width, 1.0, 1.0])
-    return _mitsuba_sensor(camera, width, height, scale, type="orthographic")
+    return _mitsuba_sensor(request, scale, type="orthographic")
 
 
-def _thin_lens(
-    camera: ViewerCamera, width: int, height: int, aperture: float, focus: float = 1.0
-) -> mi.Sensor:
+def _thin_lens(request: FrameRequest, aperture: float, focus: float = 1.0) -> mi.Sensor:
     """Return a thin lens; aperture (radius) and focus are in units of the target's distance."""
     if aperture == 0:  # Mitsuba warns at every frame
-        return _pinhole(camera, width, height)
-    return _mitsuba_sensor(
-        camera,
-        width,
-        height,
-        np.eye(4),
-        type="thinlens",
-        fov=camera.fov,
-        fov_axis="y",
-        aperture_radius=aperture * camera.distance,
-        focus_distance=focus * camera.distance,
-    )
+        return _pinhole(request)
+    distance, view = request.camera.distance, {"fov": request.camera.fov, "fov_axis": "y"}
+    lens = {"aperture_radius": aperture * distance, "focus_distance": focus * distance}
+    return _mitsuba_sensor(request, np.eye(4), type="thinlens", **view, **lens)
 
 
-def _mitsuba_sensor(
-    camera: ViewerCamera, width: int, height: int, scale: np.ndarray, **settings: object
-) -> mi.Sensor:
+def _mitsuba_sensor(request: FrameRequest, scale: np.ndarray, **settings: object) -> mi.Sensor:
     """scale: (4, 4), of the sensor's axes."""
+    pose = request.camera.camera_to_world @ OPENCV_TO_MITSUBA @ scale
     return mi.load_dict(
         {
-            "to_world": mi.ScalarTransform4f(camera.camera_to_world @ OPENCV_TO_MITSUBA @ scale),
+            "to_world": mi.ScalarTransform4f(pose),
             "near_clip": NEAR_CLIP,
             "sampler": {"type": "independent", "sample_count": 1},
-            "film": film_description(width, height),
+            "film": film_description(request.width, request.height),
             **settings,
         }
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import time
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from drgs.cli.commands import CommandParser, file_or_folder, run_command
@@ -28,11 +28,6 @@ from drgs.poses.structure_from_motion import (
 )
 
 MAX_NAMES = 5  # photographs without a camera, and cameras, that are named
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of ``python -m drgs.poses``."""
-    run_command(add_arguments, "python -m drgs.poses", arguments)
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -114,6 +109,8 @@ def description_of(result: SfmResult, settings: SfmSettings) -> str:
         )
     return "\n".join(lines)
 
+
+main = partial(run_command, add_arguments, "python -m drgs.poses")
 
 if __name__ == "__main__":
     main()

@@ -14,7 +14,7 @@ import shlex
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from types import ModuleType
@@ -181,10 +181,8 @@ def reconstruct(folder: Path, settings: SfmSettings, replace: bool, watch: Progr
             # On the disk to which the files are moved.
             parent = next(path for path in (model, *model.parents) if path.is_dir())
             with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=parent) as temporary:
-                result = run_in_child(
-                    _reconstruct_in_child, settings, photographs, folder, names, Path(temporary),
-                    watch=watch,
-                )  # fmt: skip
+                task = _Reconstruction(Path(temporary), photographs, folder, names, settings)
+                result = run_in_child(_Reconstruction.run, task, watch=watch)
                 _install_model(Path(temporary, "model"), model)
         except ChildEndedError as error:
             raise UserError(
@@ -216,42 +214,34 @@ def _install_model(written: Path, model: Path) -> None:
     record.seal()
 
 
-def _reconstruct_in_child(
-    settings: SfmSettings,
-    photographs: Path,
-    dataset: Path,
-    names: Sequence[str],
-    folder: Path,
-    watch: Progress,
-) -> SfmResult:
-    """Write ``folder/model``: the function of the child process."""
-    pycolmap = require_module("pycolmap", "colmap", "structure from motion")
-    pycolmap.logging.minloglevel = 3  # errors are reported below
-    try:
-        task = _Reconstruction(pycolmap, folder, photographs, dataset, names, settings, watch)
-        model, count = task.largest()
-        written = folder / "model"
-        written.mkdir()
-        model.write_binary(written)
-        return _summarize(model, names, count)
-    except UserError:
-        raise
-    except (RuntimeError, ValueError) as error:  # pycolmap's, for errors of the user and its own
-        raise UserError(
-            f"{photographs}: structure from motion failed: COLMAP reports: {one_line(error, 500)}; "
-            f"{REMEDY}"
-        ) from None
-
-
 @dataclass
 class _Reconstruction:
-    pycolmap: ModuleType
     folder: Path  # for intermediate files
     photographs: Path
     dataset: Path  # which may have masks
     names: Sequence[str]
     settings: SfmSettings
-    watch: Progress
+    pycolmap: ModuleType = field(init=False)
+    watch: Progress = field(init=False)
+
+    def run(self, watch: Progress) -> SfmResult:
+        """Write ``folder/model``: the function of the child process."""
+        self.watch = watch
+        self.pycolmap = require_module("pycolmap", "colmap", "structure from motion")
+        self.pycolmap.logging.minloglevel = 3  # errors are reported below
+        try:
+            model, count = self.largest()
+            written = self.folder / "model"
+            written.mkdir()
+            model.write_binary(written)
+            return _summarize(model, self.names, count)
+        except UserError:
+            raise
+        except (RuntimeError, ValueError) as error:  # pycolmap's, also for errors of the user
+            raise UserError(
+                f"{self.photographs}: structure from motion failed: COLMAP reports: "
+                f"{one_line(error, 500)}; {REMEDY}"
+            ) from None
 
     def largest(self) -> tuple[pycolmap.Reconstruction, int]:
         """Return the largest reconstruction, and the number of all."""

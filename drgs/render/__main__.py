@@ -11,7 +11,6 @@ Writes PNGs, with ``metrics.json`` (``--split``) or ``orbit.webp`` (``--orbit``)
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,11 +18,12 @@ from pathlib import Path
 import mitsuba as mi
 
 from drgs.cli.commands import (
+    SIZE,
+    VECTOR,
     CommandParser,
     bounded_int,
     degrees,
     file_or_folder,
-    finite_number,
     run_command,
 )
 from drgs.cli.execution import add_execution_arguments, execution_settings, select_variant
@@ -57,11 +57,6 @@ ALL_OPTIONS = {"define", *CAMERA_OPTIONS, *CAMERA_OPTIONS["origin"], *MODEL_OPTI
 
 LOADER_ARGUMENTS = ("path", "parallel", "optimize")
 """Arguments of ``mi.load_file``, which takes a file's parameters by name as well."""
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of ``python -m drgs.render``."""
-    run_command(add_arguments, "python -m drgs.render", arguments)
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -99,7 +94,6 @@ def add_arguments(parser: CommandParser) -> None:
 
 def _add_cameras(parser: CommandParser) -> None:
     group = parser.add_argument_group("cameras")
-    vector = {"type": finite_number, "nargs": 3, "metavar": ("X", "Y", "Z")}
     one_of = group.add_mutually_exclusive_group().add_argument
     one_of(
         "--split", choices=("test", "train"), help="cameras of the photographs, with PSNR and SSIM"
@@ -116,14 +110,14 @@ def _add_cameras(parser: CommandParser) -> None:
         metavar="FILE.json",
         help="cameras of a file in the layout of transforms.json",
     )
-    one_of("--origin", **vector, help="position of one camera")
+    one_of("--origin", **VECTOR, help="position of one camera")
     add = group.add_argument
     add(
         "--target",
-        **vector,
+        **VECTOR,
         help="point that it looks at (default: 0 0 0, relative to the model's origin)",
     )
-    add("--up", **vector, help="up direction of --origin or --orbit (default: 0 0 1)")
+    add("--up", **VECTOR, help="up direction of --origin or --orbit (default: 0 0 1)")
     add(
         "--fov",
         type=degrees,
@@ -132,9 +126,7 @@ def _add_cameras(parser: CommandParser) -> None:
     )
     add(
         "--size",
-        type=bounded_int(1),
-        nargs=2,
-        metavar=("W", "H"),
+        **SIZE,
         help="px (default: 400 400; for --orbit, at most that, in the photographs' proportions; "
         "800 400 for --panorama)",
     )
@@ -199,10 +191,9 @@ def run_with_arguments(args: argparse.Namespace, render: Render) -> None:
         else:
             data = [] if args.data is None else [f"data.path={args.data}"]
             overrides, background = [*(args.set or ()), *data], parse_background(args.background)
-            effects = args.ignore or ()
-            model = load_model(args.what, args.scene, overrides, background, effects, render)
-            model = replace(model, error=args.error, error_images=bool(args.error_image))
-            render_model(args, model, folder)
+            model = load_model(args.what, args.scene, overrides, background, args.ignore or ())
+            error = {"error": args.error, "error_images": bool(args.error_image)}
+            render_model(args, replace(model, render=render, **error), folder)
         print(f"written: {args.out}")
 
 
@@ -275,6 +266,8 @@ def _definition(word: str) -> tuple[str, str]:
         )
     return name, value
 
+
+main = partial(run_command, add_arguments, "python -m drgs.render")
 
 if __name__ == "__main__":
     main()

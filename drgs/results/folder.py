@@ -123,11 +123,6 @@ def continue_run(folder: Path, config: FitConfig, images: Sequence[str] = ()) ->
     record.claim(names, paths, earlier=names)
 
 
-def seal_run(folder: Path) -> None:
-    """Record that the results are complete."""
-    FolderRecord(folder, COMMAND).seal()
-
-
 def image_names(split: str, views: Sequence[str]) -> list[str]:
     """Return the images of a split with views of these names, relative to the folder."""
     return [f"{kind}/{split}/{view}.png" for kind in (RENDERS, SIDE_BY_SIDE) for view in views]
@@ -255,10 +250,10 @@ def _check_removable(
         foreign += record.foreign_files(files)
     else:
         known = set(_file_names(images))
-        for name in files:
-            path = folder / name
-            if name not in known or path.is_symlink() or not path.is_file():
-                foreign.append(name)
+        paths = {name: folder / name for name in files}
+        foreign += [
+            n for n, p in paths.items() if n not in known or p.is_symlink() or not p.is_file()
+        ]
     if not _is_unmodified(folder / CONFIG):
         foreign.append(CONFIG)
     if foreign:

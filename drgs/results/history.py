@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from drgs.core.files import atomic_path
@@ -32,14 +32,6 @@ class DensityRow(DensityReport):
 
 
 DENSITY_COLUMNS = ("iteration", *(field.name for field in fields(DensityReport)))
-
-
-@dataclass(eq=False)
-class FitHistory:
-    """The rows of both tables."""
-
-    rows: list[HistoryRow] = field(default_factory=list)
-    density: list[DensityRow] = field(default_factory=list)
 
 
 def write_history(path: Path, history: Sequence[HistoryRow]) -> None:

@@ -225,7 +225,6 @@ def load_model(
     overrides: Sequence[str] = (),
     background: Background | None = None,
     ignored: Sequence[str] = (),
-    render: Render = render_views,
 ) -> Model:
     """Load a file of Gaussians or the output folder of a fit.
 
@@ -258,7 +257,6 @@ def load_model(
         ", ".join(ignored),
         path,
         tuple(values),
-        render,
     )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drgs.config.schema import FitConfig
+from drgs.gaussians.parameters import PARAMETER_NAMES
 
 TOUCH_UP_RATES = {
     "means_lr": 1.6e-5,
@@ -19,6 +20,9 @@ TOUCH_UP_RATES = {
     "decay": 0.1,
 }
 """Learning rates of a few iterations after a fit: high because they are few."""
+
+RATE_KEYS = {name: f"{name.rpartition('_')[2]}_lr" for name in PARAMETER_NAMES}
+"""Names of the initial learning rates in the section ``optimizer``, by parameter."""
 
 
 @dataclass(frozen=True)
@@ -82,15 +86,9 @@ def rates_over_time(config: FitConfig, extent: float) -> LearningRates:
     """
     optimizer = config.optimizer
     longer = math.sqrt(optimizer.views_per_step)
-    first = longer * optimizer.means_lr * extent
     last = longer * optimizer.means_lr_final * extent
-    others = {
-        "quats": longer * optimizer.quats_lr,
-        "log_scales": longer * optimizer.scales_lr,
-        "logit_opacities": longer * optimizer.opacities_lr,
-        "sh0": longer * optimizer.sh0_lr,
-        "shN": longer * optimizer.shN_lr,
-    }
+    others = {name: longer * getattr(optimizer, key) for name, key in RATE_KEYS.items()}
+    first = others.pop("means") * extent
     # Rates do not fall while images are coarse, since means move far then
     # (DashGaussian, Chen et al. 2025).
     coarse_until = config.coarse[-1].until if config.coarse else 0

@@ -9,20 +9,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
 import drgs
 from drgs.cameras.orbits import orbit_of_gaussians
 from drgs.cameras.viewpoints import FIELD_OF_VIEW, Viewpoint
-from drgs.cli.commands import (
-    MAX_PORT,
-    CommandParser,
-    bounded_int,
-    file_or_folder,
-    finite_number,
-    run_command,
-)
+from drgs.cli.commands import PORT, VECTOR, CommandParser, file_or_folder, run_command
 from drgs.cli.ending import StopRequest
 from drgs.cli.execution import add_execution_arguments, execution_settings, select_variant
 from drgs.core.environment import require_module
@@ -35,11 +29,6 @@ from drgs.results.model_arguments import UP, add_background, add_error, parse_ba
 from drgs.results.refined_cameras import training_cameras
 
 IDLE_SECONDS = 0.05  # longest wait until a camera is found to be still, or Ctrl-C to be pressed
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of ``python -m drgs.view``."""
-    run_command(add_arguments, "python -m drgs.view", arguments)
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -58,18 +47,11 @@ def add_arguments(parser: CommandParser) -> None:
     add_error(parser)
     parser.add_argument(
         "--up",
-        type=finite_number,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
+        **VECTOR,
         help="axis that the camera orbits about (default: mean up direction of the training "
         "cameras; 0 0 1 for a file)",
     )
-    parser.add_argument(
-        "--port",
-        type=bounded_int(1, MAX_PORT),
-        metavar="N",
-        help="port of the page (default: first free port from 8080)",
-    )
+    parser.add_argument("--port", **PORT)
     add_execution_arguments(parser)
     parser.set_defaults(run=run)
 
@@ -122,6 +104,8 @@ def start_of(args: argparse.Namespace, model: Model, views: Sequence[Viewpoint])
     start = StartView.from_views(views, np.median(model.gaussians.numpy().means, axis=0))
     return start if args.up is None else start.upright(np.array(args.up))
 
+
+main = partial(run_command, add_arguments, "python -m drgs.view")
 
 if __name__ == "__main__":
     main()

@@ -54,7 +54,7 @@ def viewer_page(monkeypatch):
     without_images(monkeypatch)
     screen = Mock()
 
-    def watch(server, trainer, dataset, length):
+    def watch(server, trainer, length):
         queue = RenderRequests()
 
         def ask(*_):
@@ -64,7 +64,7 @@ def viewer_page(monkeypatch):
         screen.show_progress.side_effect = lambda t, *_: t.iteration == 4 and queue.end()
         ask()
         length = unless_ended(length, queue)
-        return TrainingViewer(queue, screen, dataset), length
+        return TrainingViewer(queue, screen), length
 
     monkeypatch.setattr(training_viewer, "watch", watch)
     return screen
@@ -172,7 +172,7 @@ def test_resumed_fit_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
     config = write_project(tmp_path, model={**VALUES["model"], **FITTED_WITH})
     without_images(monkeypatch)
     with monkeypatch.context() as broken:
-        broken.setattr("drgs.fit.viewers_fit.for_viewers", lambda *_: sys.exit(7))
+        broken.setattr("drgs.fit.session.for_viewers", lambda *_: sys.exit(7))
         with pytest.raises(SystemExit):
             fit.main([str(config), "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()

@@ -41,7 +41,7 @@ EVERYTHING = {
 """Settings of a fit with effects, density control and a growing SH degree."""
 
 
-def run(trainer, queue=None, dataset=None, before=lambda _: None, stops=lambda: False, show=None):
+def run(trainer, queue=None, before=lambda _: None, stops=lambda: False, show=None):
     """A whole fit, watched if there is a queue; before: is called before its requests are served.
 
     Returns the screen, a mock, and the history. show: what the screen does with an image.
@@ -53,11 +53,11 @@ def run(trainer, queue=None, dataset=None, before=lambda _: None, stops=lambda: 
     )
     if queue is not None:
         length = unless_ended(length, queue)
-        watching = TrainingViewer(queue, screen, dataset)
+        watching = TrainingViewer(queue, screen)
     for done in iterations(trainer, history, length):
         if queue is not None:
             before(done.report.iteration)
-            watching.after_iteration(trainer, history, done, stops)
+            watching.after_iteration(done, stops)
     screen.refuse.assert_not_called()
     return screen, history
 
@@ -95,7 +95,7 @@ def test_fit_with_a_viewer_has_the_same_bytes():
     alone = make_trainer(dataset, **EVERYTHING)
     run(alone)
     watched = make_trainer(dataset, **EVERYTHING)
-    screen, _ = run(watched, queue, dataset, lambda _: queue.put(1, next(asked)))
+    screen, _ = run(watched, queue, lambda _: queue.put(1, next(asked)))
     assert len({frame.tobytes() for frame in frames_of(screen)}) >= 12
     assert alone.num_gaussians != disturbed_blobs().num_gaussians
     assert_same_bytes(alone, watched)
@@ -109,7 +109,7 @@ def test_viewer_shows_the_fit_after_the_current_iteration():
         stale.extend(render_views(trainer.scene, [view]))  # before the step's result is there
         queue.put(1, FrameRequest(EYE, WIDTH, HEIGHT))
 
-    screen, _ = run(trainer, queue, dataset, ask)
+    screen, _ = run(trainer, queue, ask)
     scene = make_scene(trainer.gaussians(), trainer.config.model, (1.0, 1.0, 1.0))
     (expected,) = render_views(scene, [view])
     assert np.array_equal(frames_of(screen)[-1], np.round(255 * expected))
@@ -123,9 +123,7 @@ def test_fit_ended_early_equals_a_fit_of_fewer_iterations(end_at):
     """And its configuration, fitted again from the start, gives its bytes."""
     dataset, queue = true_dataset(), RenderRequests()
     trainer = make_trainer(dataset, **EVERYTHING)
-    screen, history = run(
-        trainer, queue, dataset, lambda iteration: iteration == end_at and queue.end()
-    )
+    screen, history = run(trainer, queue, lambda iteration: iteration == end_at and queue.end())
     done = trainer.iteration
     # The request came when this iteration's end was already decided.
     assert done == end_at + 1 == trainer.config.last_iteration
@@ -156,7 +154,7 @@ def test_pause_stops_fit_and_clock_and_serves_requests():
             queue.put(1, FrameRequest(EYE, 8, 8))
 
     start = time.perf_counter()
-    screen, history = run(trainer, queue, dataset, pause, show=ask_for_more)
+    screen, history = run(trainer, queue, pause, show=ask_for_more)
     assert history.wall_s < time.perf_counter() - start - 0.5  # in the pause
     assert during == [2] * 5
     assert [frame.shape[1] for frame in frames_of(screen)] == [8, 9, 10, 11, 12]
@@ -171,8 +169,8 @@ def test_ctrl_c_and_ending_early_work_during_a_pause(ends):
     if ends:
         queue.end()
         assert unless_ended(until_planned_end, queue)(trainer)  # nothing is fitted yet
-    run(trainer, queue, plain_dataset(), stops=lambda: not ends)
+    run(trainer, queue, stops=lambda: not ends)
     assert trainer.iteration == (1 if ends else 3)
     queue, trainer = RenderRequests(), make_trainer(plain_dataset(), iterations=3)
-    run(trainer, queue, plain_dataset(), lambda iteration: iteration == 3 and queue.end())
+    run(trainer, queue, lambda iteration: iteration == 3 and queue.end())
     assert trainer.iteration == trainer.config.iterations == 3

@@ -41,7 +41,7 @@ def test_every_key_has_a_row(rows):
 
 def test_rows_have_type_default_and_description(rows):
     description = FitConfig.model_fields["iterations"].description
-    assert rows["iterations"] == ["integer ≥ 1", "30000", description]
+    assert rows["iterations"] == ["integer ≥ 1", "30000", " ".join(description.split())]
     assert rows["data.path"][:2] == ["path", "required"]
     assert rows["data.background"][:2] == ["color", "null"]
     assert rows["densify.adc.prune_opacity"][:2] == ["number ≥ 0, < 1", "0.005"]

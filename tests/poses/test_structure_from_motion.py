@@ -200,7 +200,7 @@ def test_photographs_that_share_few_points_with_the_others_are_left_out(shared, 
 def steps_of(folder, names, **settings):
     reconstruction = sfm._Reconstruction  # private: a whole search takes minutes
     folders = folder / "work", folder, folder
-    return reconstruction(None, *folders, names, SfmSettings(**settings), lambda *step: None)
+    return reconstruction(*folders, names, SfmSettings(**settings))
 
 
 def test_colmap_gets_the_masks_of_a_fit(tmp_path):
@@ -319,12 +319,12 @@ def test_errors_of_colmap_are_one_line(tmp_path, monkeypatch, module, message):
     else:
         pytest.importorskip("pycolmap")
     # The function of the child process, which would not have what is set here.
-    steps, in_child = sfm._Reconstruction, sfm._reconstruct_in_child  # private, as above
+    steps = sfm._Reconstruction  # private, as above
     error = RuntimeError("[reader.cc:1]\nno such image")
     monkeypatch.setattr(steps, "largest", Mock(side_effect=error))
-    folders = tmp_path, tmp_path, [], tmp_path
+    task = steps(tmp_path, tmp_path, tmp_path, [], SfmSettings())
     with pytest.raises(UserError, match=message) as error:
-        in_child(SfmSettings(), *folders, lambda *step: None)
+        task.run(lambda *step: None)
     assert "\n" not in str(error.value)
 
 
@@ -338,11 +338,11 @@ def write_model(tmp_path, monkeypatch):
         save(tmp_path / f"{k}.png")
 
     def found(content, replace=False, act=lambda temporary: None):
-        def run(function, settings, images, folder, names, temporary, **_):
-            act(temporary)
-            (temporary / "model").mkdir()
+        def run(function, task, **_):
+            act(task.folder)
+            (task.folder / "model").mkdir()
             for name in MODEL_FILES:
-                (temporary / "model" / name).write_text(content)
+                (task.folder / "model" / name).write_text(content)
             return content
 
         monkeypatch.setattr(sfm, "run_in_child", run)

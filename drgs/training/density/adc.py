@@ -7,7 +7,6 @@ except where a docstring states otherwise. Rows are chosen on the host; ties are
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, cast
 
@@ -40,32 +39,25 @@ class AdcConfig(Section):
 
     scaled: ClassVar = ("reset_every", "white_background_reset")
 
-    grad_threshold: float = Field(
-        2e-4,
-        gt=0,
-        description="Clone or split a Gaussian whose 2D position gradient has at least this mean "
-        "norm, in NDC units, over the views that it is visible in.",
-    )
-    clone_scale: float = Field(
-        0.01, gt=0, description="Clone up to this largest scale, split above it; in scene extents."
-    )
-    split_count: int = Field(
-        2, ge=2, le=1_000_000, description="Number of samples that replace a split Gaussian."
-    )
-    split_shrink: float = Field(1.6, gt=1, description="Divisor of the samples' scales.")
-    prune_opacity: float = Field(0.005, ge=0, lt=1, description="Remove less opaque Gaussians.")
-    prune_scale: float = Field(
-        0.1,
-        gt=0,
-        description="Remove Gaussians of a larger scale after the first reset; in scene extents.",
-    )
-    reset_every: Count = Field(
-        3000, ge=1, description="Iterations between opacity resets, up to densify.stop."
-    )
-    reset_opacity: float = Field(0.01, gt=0, lt=1, description="Maximum opacity after a reset.")
-    white_background_reset: Count | None = Field(
-        500, ge=1, description="Iteration of an extra reset if the background is white; null: none."
-    )
+    grad_threshold: float = Field(2e-4, gt=0)
+    """Clone or split a Gaussian whose 2D position gradient has at least this mean norm, in NDC
+    units, over the views that it is visible in."""
+    clone_scale: float = Field(0.01, gt=0)
+    """Clone up to this largest scale, split above it; in scene extents."""
+    split_count: int = Field(2, ge=2, le=1_000_000)
+    """Number of samples that replace a split Gaussian."""
+    split_shrink: float = Field(1.6, gt=1)
+    """Divisor of the samples' scales."""
+    prune_opacity: float = Field(0.005, ge=0, lt=1)
+    """Remove less opaque Gaussians."""
+    prune_scale: float = Field(0.1, gt=0)
+    """Remove Gaussians of a larger scale after the first reset; in scene extents."""
+    reset_every: Count = Field(3000, ge=1)
+    """Iterations between opacity resets, up to densify.stop."""
+    reset_opacity: float = Field(0.01, gt=0, lt=1)
+    """Maximum opacity after a reset."""
+    white_background_reset: Count | None = Field(500, ge=1)
+    """Iteration of an extra reset if the background is white; null: none."""
 
     @override
     def check(self, config: FitConfig) -> None:
@@ -164,12 +156,7 @@ class AdaptiveDensityControl(DensityStrategy):
         Raises ``UserError`` if no Gaussian would remain: such a fit cannot recover.
         """
         adc, num_before = self.settings, population.num_rows
-        views = np.maximum(np.array(self.views, float), 1)
-        norms = population.gather(np.array(self.gradient_norms, float) / views)
-        with np.errstate(over="ignore"):
-            scales = np.exp(population.host("log_scales")).max(axis=1)
-        opacities = expit(population.host("logit_opacities"))
-        chosen = self._choose_rows(norms, opacities, scales, population.extent, iteration)
+        chosen = self._choose_rows(population, iteration)
         num_added = len(chosen.clone) + len(chosen.split) * adc.split_count
         if len(chosen.keep) + num_added == 0:
             raise UserError(
@@ -197,16 +184,6 @@ class AdaptiveDensityControl(DensityStrategy):
         population.replace("logit_opacities", dr.select(logits > ceiling, ceiling, logits))
 
     @override
-    def state(self) -> dict[str, np.ndarray]:
-        return {"gradient_norms": np.array(self.gradient_norms), "views": np.array(self.views)}
-
-    @override
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        float_type = type(self.views)
-        self.gradient_norms = from_host(float_type, state["gradient_norms"])
-        self.views = from_host(float_type, state["views"])
-
-    @override
     def max_num_gaussians(self, start: int, iterations: int) -> int:
         """Return ``max_gaussians``, or fewer if changes that double the rows do not reach it."""
         config, last = self.config, min(iterations, self.config.stop - 1)
@@ -216,20 +193,18 @@ class AdaptiveDensityControl(DensityStrategy):
             return max(start, config.max_gaussians)
         return start * self.settings.split_count**changes
 
-    def _choose_rows(
-        self,
-        norms: np.ndarray,
-        opacities: np.ndarray,
-        scales: np.ndarray,
-        extent: float,
-        iteration: int,
-    ) -> _ChosenRows:
-        """Decide about every row; scales: (N,) largest standard deviation, world units.
+    def _choose_rows(self, population: Population, iteration: int) -> _ChosenRows:
+        """Decide about every row.
 
         Comparisons are written such that NaN counts as transparent and as too large. Large ones are
         pruned once the first regular opacity reset is over.
         """
-        config, adc = self.config, self.settings
+        config, adc, extent = self.config, self.settings, population.extent
+        views = np.maximum(np.array(self.views, float), 1)
+        norms = population.gather(np.array(self.gradient_norms, float) / views)
+        with np.errstate(over="ignore"):
+            scales = np.exp(population.host("log_scales")).max(axis=1)  # largest deviations
+        opacities = expit(population.host("logit_opacities"))
         small = scales <= adc.clone_scale * extent
         transparent = ~(opacities >= adc.prune_opacity)
         limit = adc.prune_scale * extent if iteration > adc.reset_every else np.inf

@@ -60,20 +60,13 @@ HALF_OPACITY, HALF_OPACITY_RANGE = 0.6, (1e-4, 1 - 1e-4)
 class BudgetConfig(Section):
     """The strategy ``budget``: growth to a given number of Gaussians, where errors are largest."""
 
-    gaussians: Resolved[Count] = Field(
-        UNRESOLVED,
-        ge=4,
-        description="Number of Gaussians after two thirds of the changes. null: 250 times the "
-        "square root of an image's number of pixels, 100,000 for 400 x 400 px.",
-    )
-    error_every: Count = Field(
-        10,
-        ge=1,
-        description="Iterations between measurements of errors; each takes half an iteration.",
-    )
-    prune_opacity: float = Field(
-        0.05, ge=0, lt=1, description="Replace less opaque Gaussians by halves of others."
-    )
+    gaussians: Resolved[Count] = Field(UNRESOLVED, ge=4)
+    """Number of Gaussians after two thirds of the changes. null: 250 times the square root of an
+    image's number of pixels, 100,000 for 400 x 400 px."""
+    error_every: Count = Field(10, ge=1)
+    """Iterations between measurements of errors; each takes half an iteration."""
+    prune_opacity: float = Field(0.05, ge=0, lt=1)
+    """Replace less opaque Gaussians by halves of others."""
 
 
 @STRATEGIES.register("budget", section=BudgetConfig)
@@ -175,11 +168,11 @@ class GrowthToNumber(DensityStrategy):
 
     @override
     def state(self) -> dict[str, np.ndarray]:
-        return {"errors": np.array(self.errors), "first": np.array(self.first)}
+        return {**super().state(), "first": np.array(self.first)}
 
     @override
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        self.errors = from_host(type(self.errors), state["errors"])
+        super().restore(state)
         self.first = int(state["first"])
 
     @override

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -13,7 +12,6 @@ from drgs.accuracy.pipeline import pipeline_of
 from drgs.cameras.camera import Camera
 from drgs.cameras.lens import PINHOLE
 from drgs.cameras.viewpoints import Viewpoint
-from drgs.config.approximations import Approximations
 from drgs.config.schema import FitConfig
 from drgs.core.arrays import types_of
 from drgs.core.types import Float, TensorXf
@@ -46,27 +44,15 @@ class Floaters(DensityStrategy):
     no other camera contradicts, and hides the scene from places between them.
     """
 
-    def __init__(
-        self,
-        views: Sequence[Viewpoint],
-        iterations: int,
-        approximations: Approximations,
-        near: float,
-    ) -> None:
-        self.views = evenly_spaced(views, MAX_VIEWS) if len(views) >= MIN_VIEWS else ()
-        self.due = {round(share * iterations) for share in SHARES} if self.views else set()
-        # Two planes, for two sums at once.
-        self.pipeline = pipeline_of(approximations, 0, (depth_feature, depth_feature))
-        self.near = near  # scene units
-
-    @classmethod
-    @override
-    def from_config(cls, config: FitConfig, dataset: Dataset | None, section: None) -> Floaters:
+    def __init__(self, config: FitConfig, dataset: Dataset | None) -> None:
+        train, model = () if dataset is None else dataset.train, config.model
         # What is transparent in a photograph is empty: nothing floats before it.
-        train = () if dataset is None else dataset.train
-        views = train if any(view.alpha is None for view in train) else ()
-        model = config.model
-        return cls(views, config.iterations, model.approximations, model.near_plane)
+        is_used = len(train) >= MIN_VIEWS and any(view.alpha is None for view in train)
+        self.views = evenly_spaced(train, MAX_VIEWS) if is_used else ()
+        self.due = {round(share * config.iterations) for share in SHARES} if is_used else set()
+        # Two planes, for two sums at once.
+        self.pipeline = pipeline_of(model.approximations, 0, (depth_feature, depth_feature))
+        self.near = model.near_plane  # scene units
 
     @override
     def is_due(self, iteration: int) -> bool:

@@ -48,34 +48,21 @@ _UNIT_OF_WORD = 2.0**-24
 class McmcConfig(Section):
     """The strategy ``mcmc`` (Kheradmand et al. 2024): relocation, noise and regularisers."""
 
-    gaussians: Resolved[Count] = Field(
-        UNRESOLVED, ge=4, description="Final number of Gaussians. null: as with budget."
-    )
-    growth: float = Field(
-        0.05, ge=0, le=10, description="Relative growth of the population at each change."
-    )
-    spread: float = Field(
-        1.0,
-        ge=0,
-        le=10,
-        description="Displacement of copies, in standard deviations; 0 in the paper.",
-    )
-    min_opacity: float = Field(
-        0.005, gt=0, lt=1, description="Relocate Gaussians up to this opacity."
-    )
-    noise_lr: float = Field(
-        1e5,
-        ge=0,
-        le=1e12,
-        description="Factor of the noise on means, times their rate and the covariance in squared "
-        "scene extents. The paper's value, about 1e7, costs 2 dB in small images.",
-    )
-    opacity_weight: float = Field(
-        0.01, ge=0, le=1e6, description="Weight of the mean opacity in the loss."
-    )
-    scale_weight: float = Field(
-        0.05, ge=0, le=1e6, description="Weight of the mean scale, in scene extents, in the loss."
-    )
+    gaussians: Resolved[Count] = Field(UNRESOLVED, ge=4)
+    """Final number of Gaussians. null: as with budget."""
+    growth: float = Field(0.05, ge=0, le=10)
+    """Relative growth of the population at each change."""
+    spread: float = Field(1.0, ge=0, le=10)
+    """Displacement of copies, in standard deviations; 0 in the paper."""
+    min_opacity: float = Field(0.005, gt=0, lt=1)
+    """Relocate Gaussians up to this opacity."""
+    noise_lr: float = Field(1e5, ge=0, le=1e12)
+    """Factor of the noise on means, times their rate and the covariance in squared scene extents.
+    The paper's value, about 1e7, costs 2 dB in small images."""
+    opacity_weight: float = Field(0.01, ge=0, le=1e6)
+    """Weight of the mean opacity in the loss."""
+    scale_weight: float = Field(0.05, ge=0, le=1e6)
+    """Weight of the mean scale, in scene extents, in the loss."""
 
     @override
     def check(self, config: FitConfig) -> None:

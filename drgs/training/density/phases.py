@@ -38,7 +38,7 @@ def density_strategy(
         growth = cast(DensityStrategy, strategy.value.from_config(config, dataset, section))
     phases: list[DensityStrategy] = [growth]
     if densify.remove_floaters:
-        phases.append(Floaters.from_config(config, dataset, None))
+        phases.append(Floaters(config, dataset))
     if densify.prune.to is not None:
         phases.append(NaturalSelection(config))
     return growth if len(phases) == 1 else PhasedStrategy(phases)

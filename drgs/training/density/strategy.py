@@ -91,7 +91,8 @@ class DensityStrategy(Protocol):
         make = cast("Callable[..., DensityStrategy]", cls)
         return make() if section is None else make(section)
 
-    by_row: Sequence[str] = ()  # names in :meth:`state` of arrays with a row for each Gaussian
+    by_row: Sequence[str] = ()
+    """Names in :meth:`state` of arrays with a row for each Gaussian: by default, of attributes."""
 
     start_share, stop_share, latest_stop = 1 / 20, 1 / 2, math.inf
     """For schedules that are not given: shares of the iterations that are at most ``densify.start``
@@ -144,10 +145,12 @@ class DensityStrategy(Protocol):
 
     def state(self) -> dict[str, np.ndarray]:
         """Return finite arrays by name: with a row for each Gaussian here, or a number."""
-        return {}
+        return {name: np.array(getattr(self, name)) for name in self.by_row}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from :meth:`state`, where :meth:`begin` was called; other names are ignored."""
+        for name in self.by_row:
+            setattr(self, name, from_host(type(getattr(self, name)), state[name]))
 
     def max_num_gaussians(self, start: int, iterations: int) -> int:
         """Return the most Gaussians of a fit from ``start`` on; called without :meth:`begin`."""

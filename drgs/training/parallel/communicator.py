@@ -31,14 +31,6 @@ T = TypeVar("T")
 class SingleProcess:
     """The used part of ``mpi4py.MPI.Comm``, for a process that is alone: sends are copies."""
 
-    def Get_rank(self) -> int:
-        """Return 0."""
-        return 0
-
-    def Get_size(self) -> int:
-        """Return 1."""
-        return 1
-
     def Ibcast(self, array: np.ndarray, root: int) -> None:
         """Do nothing: there is one process."""
 
@@ -55,6 +47,8 @@ class Communicator:
     """The processes of a fit, numbered by ``rank`` from 0; by default this one alone."""
 
     comm: Any = field(default_factory=SingleProcess)  # mpi4py.MPI.Comm
+    rank: int = 0  # the number of this process
+    size: int = 1  # the number of processes
     num_on_machine: int = 1  # of the processes, those on this machine
 
     @classmethod
@@ -62,18 +56,8 @@ class Communicator:
         """Return all processes that ``mpiexec`` has started."""
         from mpi4py import MPI
 
-        here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED)
-        return cls(MPI.COMM_WORLD.Dup(), here.Get_size())
-
-    @property
-    def rank(self) -> int:
-        """The number of this process."""
-        return self.comm.Get_rank()
-
-    @property
-    def size(self) -> int:
-        """The number of processes."""
-        return self.comm.Get_size()
+        here, comm = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED), MPI.COMM_WORLD.Dup()
+        return cls(comm, comm.Get_rank(), comm.Get_size(), here.Get_size())
 
     @property
     def is_root(self) -> bool:

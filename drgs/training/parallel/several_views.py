@@ -41,8 +41,7 @@ from drgs.splatting.rendering import (
 )
 from drgs.splatting.tiles import SplatTable
 from drgs.training.parallel.communicator import Communicator
-from drgs.training.parallel.exchange import SharedView, SplatExchange
-from drgs.training.parallel.local_splats import Blocks, LocalSplats
+from drgs.training.parallel.exchange import Blocks, LocalSplats, SharedView, SplatExchange
 from drgs.training.parallel.population import renderer_of
 from drgs.training.steps import StepView, ViewGradients, ViewLoss
 
@@ -163,8 +162,10 @@ class SeveralViews:
             gaussians = dr.detach(self.integrator.gaussians)
             for camera in self._cameras(each.view):
                 pipeline = with_effects(self.integrator.pipeline, gaussians, camera)
-                splats.append(project_splats(gaussians, camera, pipeline))
-                each.local.append(LocalSplats.from_splats(splats[-1], camera, pipeline))
+                table = project_splats(gaussians, camera, pipeline)
+                counts = table.rows.width, table.num_features, table.num_keys
+                each.local.append(LocalSplats(camera, pipeline, table.boxes, *counts))
+                splats.append(table)
         return splats
 
     def _receive_results(self, each: _View, weights: Sequence[str]) -> None:

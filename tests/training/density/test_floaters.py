@@ -7,8 +7,7 @@ import pytest
 from drjit.llvm.ad import TensorXf64
 from support.populations import make, moments, rows_of, values
 
-from drgs.cameras.viewpoints import look_at, pinhole
-from drgs.config.approximations import Approximations
+from drgs.cameras.viewpoints import Viewpoint, look_at, pinhole
 from drgs.config.schema import FitConfig
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.reference import splatting as reference
@@ -17,7 +16,17 @@ from drgs.training.density.phases import density_strategy
 from drgs.training.density.strategy import DensityReport
 
 NUM_VIEWS, SIDE, NEAR = 16, 40, 0.2
-DIRECT = Approximations(antialiased=False, low_pass=0.3)
+DIRECT = {"near": NEAR, "antialiased": False, "low_pass": 0.3}
+
+
+class OpaqueView(Viewpoint):
+    alpha = None
+
+
+def floaters_of(views, iterations):
+    config = FitConfig(data={"path": "."}, iterations=iterations, model=DIRECT)
+    train = [OpaqueView(**vars(view)) for view in views]
+    return Floaters(config, SimpleNamespace(train=train))
 
 
 def ring():
@@ -73,12 +82,12 @@ def test_floaters_are_those_that_few_cameras_see_close_before_them(seed):
     expected = (cameras < 3) & (depths < 0.9) & (weights.sum(axis=0) > 0)
     assert expected[40:44].all() and not expected[44:].any()
     device = Gaussians(**{k: getattr(gaussians, k) for k in PARAMETER_NAMES}).to(TensorXf64)
-    found = Floaters(ring(), 100, DIRECT, NEAR).find(device)
+    found = floaters_of(ring(), 100).find(device)
     np.testing.assert_array_equal(found, expected)
 
 
 def test_floaters_are_removed_three_times_and_the_others_keep_their_moments(monkeypatch):
-    strategy = Floaters(ring(), 1000, DIRECT, NEAR)
+    strategy = floaters_of(ring(), 1000)
     assert [i for i in range(2000) if strategy.is_due(i)] == [500, 700, 900]
     optimizer = make([0.05] * 5, 0.5)
     before, former = values(optimizer), moments(optimizer, "means")
@@ -96,12 +105,12 @@ def test_floaters_are_removed_three_times_and_the_others_keep_their_moments(monk
 def test_nothing_floats_before_what_is_cut_out(alpha, is_due):
     views = [SimpleNamespace(**vars(view), alpha=alpha) for view in ring()]
     config = FitConfig(data={"path": "."}, iterations=100)
-    strategy = Floaters.from_config(config, SimpleNamespace(train=views), None)
+    strategy = Floaters(config, SimpleNamespace(train=views))
     assert strategy.is_due(70) == is_due
 
 
 def test_few_views_and_a_setting_leave_them():
-    assert not any(map(Floaters(ring()[:11], 100, DIRECT, NEAR).is_due, range(200)))
+    assert not any(map(floaters_of(ring()[:11], 100).is_due, range(200)))
     config = FitConfig(data={"path": "."}, densify={"remove_floaters": False})
     assert not hasattr(density_strategy(config), "phases")
     phases = density_strategy(replace_setting(config, True)).phases
