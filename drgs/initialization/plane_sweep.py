@@ -62,7 +62,7 @@ class _Photograph:
     features: np.ndarray  # (H, W, CHANNELS) float32
 
     @staticmethod
-    def of(view: View) -> _Photograph:
+    def shrink(view: View) -> _Photograph:
         factor = max(1, round(view.width / WIDTH))
         rows, columns = (side // factor * factor for side in (view.height, view.width))
         blocks = np.asarray(view.image)[:rows, :columns]
@@ -129,7 +129,7 @@ def swept_points(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     photographs = {}
     swept = [i for i in evenly_spaced(range(len(views)), MAX_PHOTOGRAPHS) if neighbours[i]]
     for index in {*swept, *(other for i in swept for other in neighbours[i])}:
-        photographs[index] = _Photograph.of(views[index])
+        photographs[index] = _Photograph.shrink(views[index])
     maps = {
         i: _sweep(photographs[i], [photographs[j] for j in neighbours[i]], inverse) for i in swept
     }
@@ -138,7 +138,7 @@ def swept_points(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     for index in swept:
         others = [j for j in _by_distance(views, index) if j in maps][:NUM_CHECKED]
         pairs = [(photographs[j], maps[j]) for j in others]
-        where, positions = _confirmed(photographs[index], maps[index], pairs, step)
+        where, positions = _find_confirmed(photographs[index], maps[index], pairs, step)
         points.append(positions)
         colors.append(photographs[index].features.reshape(-1, CHANNELS)[where, :3])
     return np.concatenate(points), np.concatenate(colors)
@@ -177,7 +177,7 @@ def _sweep(
     costs = []
     for other in others:
         place, shows = other.place(point + _relative(photograph.view, other.view))
-        pairs = zip(_interpolated(other, place, shows), own, strict=True)
+        pairs = zip(_interpolate(other, place, shows), own, strict=True)
         differences: Any = sum(dr.abs(a - b) for a, b in pairs)
         cost = dr.minimum(differences / CHANNELS, MAX_COST)
         costs.append(dr.select(shows, cost, MAX_COST))
@@ -206,7 +206,7 @@ def _features(photograph: _Photograph, pixel: UInt32, active: Bool | bool) -> li
     return [dr.gather(LLVM.Float, table, first + k, active) for k in range(CHANNELS)]
 
 
-def _interpolated(photograph: _Photograph, place: Array2f, active: Bool) -> list[Float]:
+def _interpolate(photograph: _Photograph, place: Array2f, active: Bool) -> list[Float]:
     """Return the features at places (px), bilinearly."""
     height, width = photograph.shape
     x, y = place.x - 0.5, place.y - 0.5
@@ -220,7 +220,7 @@ def _interpolated(photograph: _Photograph, place: Array2f, active: Bool) -> list
     ]
 
 
-def _confirmed(
+def _find_confirmed(
     photograph: _Photograph,
     inverse: np.ndarray,
     others: Sequence[tuple[_Photograph, np.ndarray]],

@@ -213,7 +213,7 @@ def test_fit_starts_from_the_points_of_the_model(tmp_path):
     [
         ({"max_point_error": 1e-9}, r"leave none of \d+ points \(their errors are"),
         ({"max_point_error": 1.0, "point_cloud": "cloud.ply"}, r"only COLMAP's .*cloud.ply"),
-        ({"min_track_length": 2, "start": "random"}, r"init.min_track_length: .* random points; "),
+        ({"min_track_length": 2, "start": "random"}, r"init.min_track_length: .* other points; "),
     ],
 )
 def test_limits_that_leave_no_points_are_refused(tmp_path, monkeypatch, init, message):

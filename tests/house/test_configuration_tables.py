@@ -45,5 +45,5 @@ def test_rows_have_type_default_and_description(rows):
     assert rows["data.path"][:2] == ["path", "required"]
     assert rows["data.background"][:2] == ["color", "null"]
     assert rows["densify.adc.prune_opacity"][:2] == ["number ≥ 0, < 1", "0.005"]
-    assert rows["init.start"][:2] == ["auto, masks, points, random", "auto"]
+    assert rows["init.start"][:2] == ["auto, masks, points, sweep, random", "auto"]
     assert rows["coarse"][:2] == ["list of {until, factor}, or null", "null"]

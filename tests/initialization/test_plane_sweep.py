@@ -28,7 +28,7 @@ def texture(x, y):
 
 
 def height(x):
-    """Of the ground, scene units: a step of 0.3 at x = 0."""
+    """Height of the ground, scene units: a step of 0.3 at x = 0."""
     return np.where(x > 0, 0.3, 0.0)
 
 
