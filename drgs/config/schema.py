@@ -146,6 +146,8 @@ class InitConfig(Section):
     NeRF-synthetic scenes, else a box derived from the cameras."""
     opacity: float = Field(0.1, ge=1e-6, le=0.999999)
     """Initial opacity."""
+    sky: bool = True
+    """Add Gaussians far behind a start at points, where photographs agree that there is sky."""
     point_cloud: PathField | None = None
     """PLY with x, y, z (and red, green, blue), or a points3D file of COLMAP. null: the dataset's
     own (ply_file_path, points3D), unless half_extent is given or masks are used."""

@@ -19,6 +19,8 @@ from drgs.datasets.other_programs import OPENSFM_FILE, read_opensfm_points
 from drgs.datasets.types import Dataset, View
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
+from drgs.initialization.sky import OPACITY as SKY_OPACITY
+from drgs.initialization.sky import Sky, find_sky
 from drgs.initialization.start_box import (
     FARTHEST,
     MIN_FACING_SHARE,
@@ -71,6 +73,7 @@ class Start:
     colors: np.ndarray | None  # (N, 3) display space 0..1; None: not known
     description: str  # for the user
     gaussians: Gaussians | None = None  # to start from as they are
+    sky: Sky | None = None  # further Gaussians
 
 
 def initial_gaussians(config: FitConfig, dataset: Dataset) -> Gaussians:
@@ -86,24 +89,30 @@ def gaussians_at(start: Start, config: FitConfig) -> Gaussians:
 
     The standard deviation is the root mean square distance to the 3 nearest
     other points, which is that of the 3DGS reference (``distCUDA2``). The opacity is
-    ``init.opacity``, the degree ``model.sh_degree``. Without colours: grey. Identity rotations; SH
-    coefficients above degree 0 are zero.
+    ``init.opacity`` (of sky, ``sky.OPACITY``), the degree ``model.sh_degree``. Without colours:
+    grey. Identity rotations; SH coefficients above degree 0 are zero.
     """
     if start.gaussians is not None:
         return start.gaussians
-    num, init = len(start.means), config.init
     means = np.ascontiguousarray(start.means, np.float32)
-    colors = np.full((num, 3), 0.5) if start.colors is None else start.colors
+    colors = np.full(means.shape, 0.5) if start.colors is None else start.colors
     spacing = np.sqrt(mean_squared_neighbour_distance(means))
     spacing = np.maximum(spacing, MIN_SPACING * _median_radius(means))
+    opacities = np.full(len(means), config.init.opacity)
+    if (sky := start.sky) is not None:
+        means = np.concatenate([means, sky.means], dtype=np.float32)
+        colors = np.concatenate([colors, sky.colors])
+        spacing = np.append(spacing, np.full(len(sky.means), sky.scale))
+        opacities = np.append(opacities, np.full(len(sky.means), SKY_OPACITY))
+    num = len(means)
     log_scales = np.repeat(np.log(spacing)[:, None], 3, axis=1)
-    logit = np.log(init.opacity / (1 - init.opacity))
+    logits = np.log(opacities / (1 - opacities))
     sh0 = (np.asarray(colors, np.float64) - 0.5) / SH_C0
     return Gaussians(
         means=means,
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (num, 1)),
         log_scales=log_scales.astype(np.float32),
-        logit_opacities=np.full(num, logit, np.float32),
+        logit_opacities=logits.astype(np.float32),
         sh0=sh0.astype(np.float32)[:, None, :],
         shN=np.zeros((num, (config.model.sh_degree + 1) ** 2 - 1, 3), np.float32),
     )
@@ -148,6 +157,11 @@ def start_of(config: FitConfig, dataset: Dataset) -> Start:
     else:
         swept = _swept_start(config, dataset) if init.start in ("auto", "sweep") else None
         start = swept or _random_start(config, dataset)
+        if swept is None:
+            return replace(start, description=start.description + note)
+    if init.sky and (sky := find_sky(dataset.train, start.means)) is not None:
+        note += f", and {len(sky.means):,} Gaussians behind: {sky.share:.0%} of directions are sky"
+        start = replace(start, sky=sky)
     return replace(start, description=start.description + note)
 
 

@@ -175,9 +175,12 @@ class GrowthByPower(Change):
 
 def replace_strategy(trainer: Trainer, kind: type[GrowthToNumber]) -> None:
     """Give a trainer another variant of its strategy."""
-    former = trainer.density
+    phases = getattr(trainer.density, "phases", [trainer.density])
+    former = phases[0]
     assert isinstance(former, GrowthToNumber), "the study's fits have this one"
-    trainer.density = kind(former.config, former.coarse)
+    phases[0] = kind(former.config, former.settings, former.coarse)
+    if len(phases) == 1:
+        trainer.density = phases[0]
     trainer.density.begin(trainer.population)
 
 
