@@ -97,7 +97,8 @@ class RayColors(SplatFeatures):
         d_basis = [(basis, d) for basis in self.basis[pixel] for d in d_colors]
         pairs = zip(coefficients, d_basis, strict=True)
         sums = [dr.fma(d, basis, total) for total, (basis, d) in pairs]
-        return sums + super().add_derivatives(others, stored, pixel, weight, g[CHANNELS:])
+        rest = zip(others, g[CHANNELS:], strict=True)
+        return sums + [dr.fma(weight, derivative, total) for total, derivative in rest]
 
     @override
     def tangents(self, stored: list[Float], d_stored: list[Float], pixel: int) -> list[Float]:

@@ -142,7 +142,8 @@ class TrainingEffect(Protocol):
     aovs = ""  # outputs of the integrator besides colour
     upload_bytes = 0  # of a pixel: its upload of a view, at most
     by_row: frozenset[str] = frozenset()  # names in its state that have a row for each Gaussian
-    files: ClassVar[tuple[str, ...]] = ()  # that :meth:`write` writes; (): NAME.json, or none
+    has_numbers: ClassVar[bool] = False  # whether :meth:`write` writes NAME.json by default
+    files: ClassVar[tuple[str, ...]] = ()  # that :meth:`write` writes instead
 
     @classmethod
     def is_used(cls, config: FitConfig, dataset: Dataset) -> bool:

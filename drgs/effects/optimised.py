@@ -30,6 +30,8 @@ class OptimisedEffect(TrainingEffect):
     steps are as long as the rate. The numbers are checked, and part of checkpoints.
     """
 
+    has_numbers = True
+
     def __init__(self, values: Mapping[str, np.ndarray], rates: Mapping[str, float]) -> None:
         """values: (V, K) each, or (1, K) for all views; rates: per step."""
         self.rates = dict(rates)

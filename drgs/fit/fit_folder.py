@@ -160,7 +160,8 @@ class FitFolder:
         for_viewers: None if other viewers render as the fit does; wall_s: time of iterations.
         """
         out, config, dataset, render = self.path, trainer.config, trainer.dataset, trainer.images
-        (out / folder.METRICS).unlink(missing_ok=True)  # of a fit that goes on: no longer true
+        with suppress(OSError):  # of a fit that goes on: no longer true
+            (out / folder.METRICS).unlink()
         saved_gaussians(gaussians, config).save(out / folder.GAUSSIANS)
         for effect in trainer.effects:
             effect.write(out, dataset)

@@ -47,8 +47,9 @@ ERROR_BUDGET = "error_budget.json"  # of ``drgs render --error``
 
 def result_names() -> list[str]:
     """Return the files of a fit but for ``config.yml``, with those of effects."""
-    effects = EFFECTS.all()
-    names = [name for each in effects for name in each.value.files or (f"{each.name}.json",)]
+    names = []
+    for each in EFFECTS.all():
+        names += each.value.files or [f"{each.name}.json"] * each.value.has_numbers
     names += [CHECKPOINT, CURVES, DENSITY, EXAMINATION, HISTORY, METRICS, ORBIT, ORBIT_GIF]
     names += [BUDGET_PLAN, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, RENDERS, REPORT, SIDE_BY_SIDE]
     return [*names, VIEWER, VIEWS]

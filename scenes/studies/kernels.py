@@ -245,9 +245,11 @@ def counted_trips() -> Iterator[list[np.ndarray]]:
     trips: list[np.ndarray] = []
     original = dr.while_loop
 
-    def while_loop(state: tuple, cond: Callable, body: Callable, **keywords: Any) -> tuple:
-        if "labels" in keywords:
-            keywords["labels"] = (*keywords["labels"], "trips")
+    def while_loop(
+        state: tuple, cond: Callable, body: Callable, labels: tuple = (), **keywords: Any
+    ) -> tuple:
+        if labels:
+            keywords["labels"] = (*labels, "trips")
         *result, count = original(
             state=(*state, dr.zeros(llvm.UInt32)),
             cond=lambda *values: cond(*values[:-1]),

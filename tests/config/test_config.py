@@ -205,8 +205,9 @@ WRONG_FILES = [
     ("data: {path: x, background: grey}", f"{BACKGROUND}'grey'"),
     ("data: {path: x, background: [0, 0, 2]}", f"{BACKGROUND}[0, 0, 2]"),
     (
-        "data: {path: x, type: llff}",
-        f"data.type must be one of 'auto', 'colmap', 'nerf_synthetic', 'nerfstudio'{MORE}'llff'",
+        "data: {path: x, type: blender}",
+        "data.type must be one of 'auto', '3dgs', 'colmap', 'llff', 'metashape', 'nerf_synthetic', "
+        f"'nerfstudio', 'opensfm'{MORE}'blender'",
     ),
     ("data: {}", "data.path is missing: Dataset folder; relative to the configuration file."),
     ("seed: 1", "data is missing: Photographs, cameras, and how to read them."),

@@ -164,6 +164,7 @@ ALLOWED_NAMES = {
     "results/folder.py": OTHER_NAMES,
     **EFFECT_NAMES,
     "datasets/folders.py": {"cameras.json"},  # of another program
+    "datasets/other_programs.py": {"cameras.json"},
 }
 
 
