@@ -12,6 +12,7 @@ not change the comparison.
 from __future__ import annotations
 
 import csv
+import importlib
 import json
 import math
 import os
@@ -30,29 +31,34 @@ import drgs  # noqa: F401  first: finds libLLVM
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from drgs.accuracy.pipeline import pipeline_of
 from drgs.bench.output import machine, markdown_table, write_rows
+from drgs.cameras.camera import Camera
 from drgs.cli.execution import select_variant
 from drgs.config.changes import with_changes
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
 from drgs.core.adam import LeanAdam
+from drgs.core.constants import SH_C0
 from drgs.core.types import Float, UInt32
 from drgs.datasets import load_dataset
 from drgs.datasets.types import View, evenly_spaced
-from drgs.gaussians.parameters import PARAMETER_NAMES
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import initial_gaussians
 from drgs.results.folder import HISTORY
 from drgs.results.metrics import psnr
+from drgs.splatting.rendering import color_features, depth_feature, render
 from drgs.training.density.budget import GROWTH_SHARE, GrowthToNumber
-from drgs.training.density.strategy import DensityReport
+from drgs.training.density.strategy import DensityReport, StepInfo
 from drgs.training.losses import Loss, LossTerm, PhotometricLoss
 from drgs.training.optimizer import Population
 from drgs.training.steps import ResolutionPhase
 from drgs.training.trainer import Trainer
 from fits import SCENES as SCENES_FOLDER
 from fits import add_case_option, make_parser, write_curves
-from scipy.special import expit
+from scipy.ndimage import distance_transform_edt
+from scipy.special import expit, logit
 from typing_extensions import override
 
 if TYPE_CHECKING:
@@ -103,7 +109,12 @@ LEGO = Scene("lego", "the original Lego", "lego.yml", 200, "nerf_synthetic/lego"
 FOX = Scene("fox", "the fox", "fox.yml", 160, "fox")
 HEAD = Scene("head", "the robot head", "photos.yml", 160, "colmap_robothead")
 
+OUTDOOR = Scene("outdoor", "the landscape", "photos.yml", 320, "outdoor")
+ROOM = Scene("room", "the room", "photos.yml", 320, "room")
+
 THREE, PHOTOGRAPHS, ALL = (SHIPPED, LEGO, FOX), (FOX, HEAD), (SHIPPED, LEGO, FOX, HEAD)
+MADE = (OUTDOOR, ROOM)  # by ``made_sets.py``
+WITH_MADE, NOT_CUT_OUT = (*ALL, *MADE), (*PHOTOGRAPHS, *MADE)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -145,6 +156,16 @@ class Given(Change):
     @override
     def values(self, config: FitConfig) -> Values:
         return {k: v(config) if callable(v) else v for k, v in self.given.items()}
+
+
+class CompactFalloff(Given):
+    """The falloff of ``examples/compact_falloff.py``."""
+
+    @override
+    def values(self, config: FitConfig) -> Values:
+        sys.path.insert(0, str(SCENES_FOLDER.parent / "examples"))
+        importlib.import_module("compact_falloff")
+        return super().values(config)
 
 
 def times_gaussians(factor: float) -> Callable[[FitConfig], int]:
@@ -215,6 +236,138 @@ class RecoveryAwarePruning(Change):
                 return report
 
         replace_strategy(trainer, Pruning)
+
+
+class CountedViews(Change):
+    """Errors count by views: the sum of a view is a multiple of the mean one, and at most four.
+
+    After FastGS (Ren et al. 2025), which splits where many views have a high error.
+    """
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        class Counting(GrowthToNumber):
+            @override
+            def update_statistics(self, step: StepInfo) -> None:
+                sums = step.weighted_sums["errors"]
+                seen = dr.select(step.visible & (sums > 0), type(sums)(1), 0)
+                mean = dr.sum(sums) / dr.maximum(dr.sum(seen), 1)
+                self.errors = self.errors + dr.minimum(sums / mean, 4)
+                dr.eval(self.errors)
+
+        replace_strategy(trainer, Counting)
+
+
+@dataclass(frozen=True)
+class PlacedAtErrors(Change):
+    """A share of the new Gaussians is placed at pixels of high error, as wide as a pixel.
+
+    After ConeGS (Baranowski et al. 2026), with the mean depth of what is there; where there is
+    nothing, that of the nearest pixel with something.
+    """
+
+    share: float
+    num_views: int = 8
+    opacity: float = 0.3
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        change = self
+
+        class Placing(GrowthToNumber):
+            @override
+            def refine(self, population: Population, iteration: int) -> DensityReport:
+                goal = self.goal(iteration)
+                keep = expit(population.host("logit_opacities")) >= self.settings.prune_opacity
+                placed = round(change.share * max(0, goal - int(keep.sum())))
+                self.reserved = placed
+                report = super().refine(population, iteration)
+                self.reserved = 0
+                if placed:
+                    rows = change.rows(trainer, placed, iteration)
+                    population.edit(population.row_numbers(), rows)
+                    self.begin(population)
+                return replace(report, num_gaussians=population.num_rows)
+
+            @override
+            def goal(self, iteration: int) -> int:
+                return super().goal(iteration) - getattr(self, "reserved", 0)
+
+        replace_strategy(trainer, Placing)
+
+    def rows(self, trainer: Trainer, count: int, iteration: int) -> dict[str, np.ndarray]:
+        """Return new rows of every parameter."""
+        rng = np.random.default_rng([trainer.config.seed, iteration])
+        views = trainer.dataset.train
+        pixels = [
+            (index, *_errors_and_depths(trainer, views[index]))
+            for index in rng.permutation(len(views))[: self.num_views]
+        ]
+        errors = np.concatenate([error.ravel() for _, error, _ in pixels])
+        chosen = rng.choice(len(errors), count, p=errors / errors.sum())
+        means, sizes, colors, first = [], [], [], 0
+        for index, error, depth in pixels:
+            view, at = views[index], chosen[(first <= chosen) & (chosen < first + error.size)]
+            row, column = np.unravel_index(at - first, error.shape)
+            first += error.size
+            x, y = (column + 0.5 - view.cx) / view.fx, (row + 0.5 - view.cy) / view.fy
+            points = np.column_stack([x, y, np.ones_like(x)]) * depth[row, column, None]
+            means.append(points @ view.camera_to_world[:3, :3].T + view.center)
+            sizes.append(depth[row, column] / view.fx)
+            colors.append(np.asarray(view.image)[row, column])
+        scales = np.log(np.concatenate(sizes))[:, None].repeat(3, axis=1)
+        new = {
+            "means": np.concatenate(means),
+            "quats": np.tile([1.0, 0, 0, 0], (count, 1)),
+            "log_scales": scales,
+            "logit_opacities": np.full(count, logit(self.opacity)),
+            "sh0": ((np.concatenate(colors) - 0.5) / SH_C0)[:, None],
+        }
+        if "shN" in trainer.optimizer.state:
+            new["shN"] = np.zeros((count, *trainer.population.value("shN").shape[1:]))
+        return {name: values.astype(np.float32) for name, values in new.items()}
+
+
+def _errors_and_depths(trainer: Trainer, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean absolute error and the mean depth of each pixel (H, W) of a pinhole."""
+    config = trainer.config.model
+    tensors = {name: trainer.population.value(name) for name in PARAMETER_NAMES}
+    pipeline = pipeline_of(
+        config.approximations,
+        trainer.sh_degree_at(max(1, trainer.iteration)),
+        (color_features, depth_feature),
+    )
+    size = view.width, view.height, config.near_plane
+    axes = view.camera_to_world[:3, :3].T
+    camera = Camera.create(mi.Float, axes, view.center, view.K, *size)
+    planes = render(Gaussians(**tensors), camera, pipeline).planes()
+    behind, *color, depth = (np.array(plane).reshape(view.height, view.width) for plane in planes)
+    background = trainer.dataset.background
+    image = np.stack(color, axis=-1) + behind[..., None] * background
+    error = np.abs(image - np.asarray(view.image)).mean(axis=-1)
+    if view.mask is not None:
+        error *= np.asarray(view.mask)
+    empty = behind > 0.5
+    depth /= np.maximum(1 - behind, 1e-6)
+    nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
+    return error, depth[tuple(nearest)] if not empty.all() else np.ones_like(depth)
+
+
+@dataclass(frozen=True)
+class NoNeedles(Change):
+    """The longest axis is at most so many times the middle one."""
+
+    ratio: float
+
+    @override
+    def after(self, trainer: Trainer, iteration: int) -> None:
+        if iteration % 20:
+            return
+        value = trainer.population.value("log_scales")
+        axes = dr.unravel(mi.Vector3f, flat(value))
+        middle = dr.sum(axes) - dr.max(axes) - dr.min(axes)
+        cut = dr.minimum(axes, middle + math.log(self.ratio))
+        trainer.population.set_values("log_scales", like(value, dr.ravel(cut)))
 
 
 # ----------------------------------------------------------------------------------------------
@@ -677,7 +830,7 @@ FORMER: Values = {
 }
 
 IDEAS = (
-    Idea("the recipe", Change(), "", scenes=ALL),
+    Idea("the recipe", Change(), "", scenes=WITH_MADE),
     Idea(
         "Gaussians less opaque than 0.05 are replaced, not 0.005",
         Given({"densify.budget.prune_opacity": 0.005}),
@@ -794,6 +947,41 @@ IDEAS = (
         scenes=PHOTOGRAPHS,
     ),
     Idea("random start", Given({"init.start": "random"}), "much worse", scenes=(HEAD,)),
+    # Where Gaussians are.
+    Idea(
+        "points of a plane sweep where there are none",
+        Given({"init.start": "random"}),
+        "photographs without points start where COLMAP's would be",
+        is_kept=True,
+        scenes=(FOX,),
+    ),
+    Idea(
+        "... in place of COLMAP's",
+        Given({"init.start": "sweep"}),
+        "less exact than COLMAP's",
+        scenes=(HEAD,),
+    ),
+    Idea(
+        "a dome of sky",
+        Given({"init.sky": False}),
+        "unseen views: +3.3 dB, from afar +0.9",
+        is_kept=True,
+        scenes=(OUTDOOR,),
+    ),
+    Idea(
+        "half of the new ones at pixels of high error",
+        PlacedAtErrors(0.5),
+        "learns photographs by heart",
+        scenes=PHOTOGRAPHS,
+    ),
+    Idea("errors count by views", CountedViews(), "worse where it matters", scenes=PHOTOGRAPHS),
+    Idea("no needles beyond 4 to 1", NoNeedles(4), "no better", scenes=PHOTOGRAPHS),
+    Idea(
+        "a falloff without exp",
+        CompactFalloff({"model.falloff": "compact"}),
+        "to be measured at full size",
+        scenes=(*ALL, ROOM),
+    ),
 )
 
 
@@ -825,7 +1013,7 @@ def fit_point(scene: Scene, idea: Idea, data: Path | None) -> Point:
     dataset = load_dataset(config.data)
     config = resolve_defaults(with_changes(config, RECIPE), dataset)
     by_case = {
-        "optimizer.scales_lr": SCALES_LR if scene in PHOTOGRAPHS else SCALES_LR_CUT_OUT,
+        "optimizer.scales_lr": SCALES_LR if scene in NOT_CUT_OUT else SCALES_LR_CUT_OUT,
         "densify.start": idea.iterations // 20,
         "densify.stop": idea.iterations * 3 // 4,
     }
@@ -881,7 +1069,7 @@ def table(points: Sequence[Point]) -> str:
     rows = []
     for idea in IDEAS:
         cells, ratios = [], []
-        for scene in ALL:
+        for scene in WITH_MADE:
             point = found.get((idea.name, scene.name))
             recipe = found.get((IDEAS[0].name, scene.name))
             if point is None or recipe is None:
@@ -897,7 +1085,7 @@ def table(points: Sequence[Point]) -> str:
         time_ratio = f"{float(np.mean(ratios)):.2f}" if ratios else ""
         kept = ("yes" if idea.is_kept else "no") if ratios else ""
         rows.append([idea.name, *cells, time_ratio, kept, idea.why])
-    header = ["test / training views", *(scene.title for scene in ALL), "time", "kept", "why"]
+    header = ["test / training views", *(scene.title for scene in WITH_MADE), "time", "kept", "why"]
     return markdown_table(header, rows)
 
 
@@ -926,7 +1114,7 @@ def main() -> None:
     add_case_option(parser, [idea.name for idea in IDEAS])
     args = parser.parse_args()
     if args.fit:
-        (scene,) = (scene for scene in ALL if scene.name == args.fit[0])
+        (scene,) = (scene for scene in WITH_MADE if scene.name == args.fit[0])
         print(json.dumps(asdict(fit_point(scene, IDEAS[int(args.fit[1]) - 1], args.data))))
         return
     if args.histories:

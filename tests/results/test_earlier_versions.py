@@ -49,7 +49,7 @@ def test_configurations_and_images_of_scenes_stay_the_same():
     removed = {**removed, "prune": ["method", "opacity", "opacity_rate"]}
     sections = {**values, "prune": values["densify"]["prune"]}
     assert all(sections[section].pop(name) for section in removed for name in removed[section])
-    assert loaded["init"].pop("gaussians") is None
+    assert loaded["init"].pop("gaussians") is None and loaded["init"].pop("sky") is True
     newer = [loaded["data"].pop(key) for key in ("leave_out", "in_memory")]
     assert [*newer, loaded["densify"].pop("remove_floaters")] == [[], None, True]
     newer = [loaded["colors"].pop(f"{name}_lr") for name in ("vignetting", "response")]
