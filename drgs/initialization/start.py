@@ -171,8 +171,8 @@ def description_of_start(config: FitConfig, start: Start) -> str:
 
 
 def _cloud_file(init: InitConfig, dataset: Dataset) -> Path | None:
-    """Return the file that a fit starts from; None: random points."""
-    if init.start == "random":
+    """Return the file that a fit starts from; None: a plane sweep, or random points."""
+    if init.start in ("sweep", "random"):
         return None
     if init.point_cloud is not None or init.half_extent is not None:
         return init.point_cloud

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.datasets import dataset_of, look_at
+from support.datasets import dataset_of, look_at, write_points
 from support.small_fits import config_of
 
 from drgs.cameras.fisheye import Fisheye
@@ -96,7 +96,7 @@ def test_photographs_that_do_not_overlap_give_no_points():
     assert len(swept_points(noise)[0]) < 0.002 * 6 * WIDTH * HEIGHT
 
 
-def test_a_fit_without_points_starts_there_or_at_random_ones():
+def test_a_fit_without_points_starts_there_or_at_random_ones(tmp_path):
     views = photographs()
     config = with_changes(config_of(), {"init.num_points": 500, "seed": 3})
 
@@ -109,6 +109,9 @@ def test_a_fit_without_points_starts_there_or_at_random_ones():
     assert "500 of " in found.description and "points of a plane sweep" in found.description
     assert np.median(np.abs(found.means[:, 2] - height(found.means[:, 0]))) < 0.02
     assert "random points" in start(dataset, start="random").description
+    write_points(tmp_path / "cloud.ply", np.zeros((9, 3)) + np.arange(9)[:, None], np.zeros((9, 3)))
+    with_points = replace(dataset, point_cloud=tmp_path / "cloud.ply")
+    assert "plane sweep" in start(with_points, start="sweep").description
     few = dataset_of(views[:2])
     with pytest.raises(UserError, match=r"init.start: a plane sweep needs photographs that over"):
         start(few, start="sweep")
