@@ -979,7 +979,7 @@ IDEAS = (
     Idea(
         "a falloff without exp",
         CompactFalloff({"model.falloff": "compact"}),
-        "to be measured at full size",
+        "no better on the whole; needs kernels of its own to save time",
         scenes=(*ALL, ROOM),
     ),
 )
