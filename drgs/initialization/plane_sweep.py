@@ -15,6 +15,7 @@ Distances are sampled evenly in their inverse, which is evenly on the film.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,8 +33,8 @@ from drgs.datasets.types import View, evenly_spaced
 
 LLVM: Any = drjit.llvm.ad  # whatever the fit's backend is
 
-MAX_PHOTOGRAPHS, WIDTH = 32, 110
-"""Photographs whose pixels become points, and about their width, px."""
+MAX_PHOTOGRAPHS, MAX_PIXELS = 32, 18_000
+"""Photographs whose pixels become points, and the number of these in each."""
 
 NUM_DISTANCES = 96
 NEAREST, FARTHEST = 0.8, 60.0
@@ -63,7 +64,7 @@ class _Photograph:
 
     @staticmethod
     def shrink(view: View) -> _Photograph:
-        factor = max(1, round(view.width / WIDTH))
+        factor = math.ceil(math.sqrt(view.width * view.height / MAX_PIXELS))
         rows, columns = (side // factor * factor for side in (view.height, view.width))
         blocks = np.asarray(view.image)[:rows, :columns]
         blocks = blocks.reshape(rows // factor, factor, columns // factor, factor, 3)
