@@ -81,7 +81,7 @@ def test_law_holds(law):
 
 
 def test_solid_angles_keep_their_areas():
-    """What the lens is for: |det J| d^2 is focal^2, at any angle."""
+    """Areas of the film per solid angle, |det J| d^2, are focal^2 at any angle."""
     camera = reference.Camera(np.eye(3), np.zeros(3), 9.0, 9.0, 0, 0, 1, 1)
     points = np.random.default_rng(0).normal(size=(50, 3)) + np.array([0, 0, 0.5])
     distance = np.linalg.norm(points, axis=1)
