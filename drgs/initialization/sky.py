@@ -23,7 +23,7 @@ MAX_PHOTOGRAPHS, NUM_DIRECTIONS = 60, 16_000
 NUM_CELLS = 24  # in a row of a photograph; a cell without points in it and around it is empty
 
 MIN_EMPTY_SHARE, MIN_VIEWS = 0.7, 2
-"""Of the photographs that look in a direction, those where it is empty; and their number."""
+"""Share of the photographs that look in a direction in which it is empty, and their number."""
 
 MAX_DEVIATION = 0.06  # median of their colours from the median colour
 

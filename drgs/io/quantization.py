@@ -16,7 +16,7 @@ MAX_LOGIT = 23 * math.log(2)
 MIN_LOGIT = -125 * math.log(2)  # of about the smallest: exp of less is no number in float32
 
 MIN_LOG_SCALE, MAX_LOG_SCALE = -126 * math.log(2), 127 * math.log(2)
-"""Of normal numbers in float32; the smallest stands for a scale of 0."""
+"""Logarithms of the extreme normal numbers of float32; the smallest one is for a scale of 0."""
 
 _REMAINING_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the other three components, by the index of one of four."""

@@ -104,7 +104,7 @@ def test_arrays_of_other_shapes_are_not_written(tmp_path, each, field):
     ("field", "value"), [("sh0", 90), ("shN", 30), ("log_scales", 60), ("log_scales", -200)]
 )
 def test_a_note_says_what_a_format_cuts_off(tmp_path, each, field, value):
-    """There is a note exactly where what is read differs from what was written."""
+    """A note is given exactly where what is read differs from what was written."""
     path, gaussians = tmp_path / f"a{each.value.suffix}", gaussians_within_ranges(40, degree=1)
     rows = [7, 9]
     getattr(gaussians, field)[rows] = value
