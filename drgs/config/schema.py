@@ -48,7 +48,7 @@ NEAR_LIMITS = (1e-9, 1e9)  # scene units, of near planes
 REFERENCE_NEAR = 0.2  # scene units: the reference's near plane, of scenes that are about 4 wide
 
 LATEST_DEGREE = 1000  # iterations between degrees of harmonics: the reference's, for 30,000
-DEGREE_SHARE = 1 / 40  # the same, as a share of all iterations
+DEGREE_SHARE = 0.15  # the same, as a share of all iterations
 
 
 def _color(value: object) -> Color | None:
@@ -169,8 +169,8 @@ class _Model(Section):
     sh_degree: int = Field(3, ge=0, le=3)
     """Degree of the spherical harmonics."""
     sh_increase_every: Resolved[Count] = Field(LATEST_DEGREE, ge=1)
-    """Iterations between increments of the degree in use, which starts at 0. Not given, or null: a
-    fortieth of all iterations, at most 1000."""
+    """Iterations between increments of the degree in use, which starts at 0. Not given, or null: 15 %
+    of all iterations, at most 1000."""
     near: Resolved[float] = Field(UNRESOLVED, ge=NEAR_LIMITS[0], le=NEAR_LIMITS[1])
     """Near plane, scene units: closer means are culled. null: the reference's 0.2 for
     NeRF-synthetic scenes, else about a twenty-fifth of the cameras' distance to the point that they

@@ -60,15 +60,15 @@ def test_lego_paper_is_the_reference_recipe():
     ("text", "start", "stop", "degree"),
     [
         ("iterations: 60000", 500, 45_000, 1000),
-        ("iterations: 7000", 350, 5250, 175),
+        ("iterations: 7000", 350, 5250, 1000),
         ("iterations: 3", 1, 2, 1),
         ("iterations: 1", 0, 1, 1),
         ("iterations: 60000\ndensify: {strategy: adc}", 500, 15_000, 1000),
-        ("iterations: 7000\ndensify: {strategy: mcmc}", 350, 5000, 175),
-        ("iterations: 7000\ndensify: {strategy: adc}", 500, 5000, 175),
-        ("iterations: 700\ndensify: {strategy: adc}", 250, 500, 18),
+        ("iterations: 7000\ndensify: {strategy: mcmc}", 350, 5000, 1000),
+        ("iterations: 7000\ndensify: {strategy: adc}", 500, 5000, 1000),
+        ("iterations: 700\ndensify: {strategy: adc}", 250, 500, 105),
         ("densify: {start: 400}\nmodel: {sh_increase_every: 900}\niterations: 500", 400, 401, 900),
-        ("densify: {stop: 90}\niterations: 500", 25, 90, 12),
+        ("densify: {stop: 90}\niterations: 500", 25, 90, 75),
     ],
 )
 def test_schedule_and_decay_follow_from_iterations_and_strategy(load, text, start, stop, degree):
@@ -95,7 +95,7 @@ def test_shorter_schedule_is_scaled_in_proportion():
     assert short.sections["cameras"].start == 200
     assert (short.densify.adc.reset_every, short.densify.adc.white_background_reset) == (600, 100)
     assert short.densify.adc.grad_threshold == config.densify.adc.grad_threshold
-    assert short.model.sh_increase_every == 150 and short.coarse[0].until == 600
+    assert short.model.sh_increase_every == 200 and short.coarse[0].until == 600
     assert with_iterations(short, 30_000) == config
     config = FitConfig(data={"path": "."}, densify={"adc": {"white_background_reset": None}})
     short = with_iterations(config, 30)

@@ -299,7 +299,7 @@ def test_all_harmonics_and_full_images_are_used_at_once(tmp_path):
     given = config(init={"gaussians": path}, iterations=4000)
     resolved = resolve_defaults(given, ring())
     assert resolved.model.sh_increase_every == 1 and resolved.coarse == []
-    assert config(iterations=4000).model.sh_increase_every == 100
+    assert config(iterations=4000).model.sh_increase_every == 600
     start = start_of(resolved, ring())
     assert start.description == f"the 40 Gaussians of {path}; low_pass was 0.3"
     smaller = start_of(with_changes(resolved, {"model.sh_degree": 1}), ring())
