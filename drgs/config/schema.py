@@ -169,8 +169,8 @@ class _Model(Section):
     sh_degree: int = Field(3, ge=0, le=3)
     """Degree of the spherical harmonics."""
     sh_increase_every: Resolved[Count] = Field(LATEST_DEGREE, ge=1)
-    """Iterations between increments of the degree in use, which starts at 0. Not given, or null: 15 %
-    of all iterations, at most 1000."""
+    """Iterations between increments of the degree in use, which starts at 0. Not given, or null:
+    15 % of all iterations, at most 1000."""
     near: Resolved[float] = Field(UNRESOLVED, ge=NEAR_LIMITS[0], le=NEAR_LIMITS[1])
     """Near plane, scene units: closer means are culled. null: the reference's 0.2 for
     NeRF-synthetic scenes, else about a twenty-fifth of the cameras' distance to the point that they
@@ -234,7 +234,7 @@ class ModelConfig(_ModelWithApproximations):
 
 
 class OptimizerConfig(Section):
-    """Adam (Kingma and Ba 2015): learning rates per step and its constants."""
+    """Adam with Nesterov's momentum (Dozat 2016): learning rates per step and its constants."""
 
     removed: ClassVar = {"epsilon": 1e-15, "means_lr_aims": []}
 

@@ -62,14 +62,30 @@ def test_make_optimizer_sets_rates_and_leaves_out_empty_parameters():
         make_optimizer(parameters(2), {"means": 1.0})
 
 
+def test_steps_are_along_nesterov_s_momentum():
+    """After Dozat 2016, in float64; the first moment's bias is corrected as in Adam."""
+    optimizer, rows = make_optimizer(parameters(4), RATES), np.arange(4)
+    value, first, second = parameters(4)["log_scales"].numpy().astype(np.float64), 0.0, 0.0
+    for seed in range(5):
+        step(optimizer, seed, rows)
+        gradient = np.random.default_rng([seed, len("log_scales")]).standard_normal((100, 3))[:4]
+        first, second = 0.9 * first + 0.1 * gradient, 0.999 * second + 0.001 * gradient**2
+        ahead = (0.9 * first + 0.1 * gradient) / (1 - 0.9 ** (seed + 1))
+        value -= RATES["log_scales"] * ahead / np.sqrt(second / (1 - 0.999 ** (seed + 1)))
+        found, moment, _ = snapshot(optimizer)["log_scales"]
+        np.testing.assert_allclose(found, value, atol=2e-6)
+        np.testing.assert_allclose(moment, first, atol=1e-6)
+
+
 @pytest.mark.slow
-def test_steps_are_those_of_adam_and_use_large_gradients_up():
+def test_lean_steps_are_those_of_adam_and_use_large_gradients_up():
     values = parameters(25_000)
     assert dr.width(values["shN"]) > LARGE_WIDTH > dr.width(values["quats"])
-    plain, ours = Adam(lr=0.0, epsilon=1e-15), make_optimizer(values, RATES)
+    plain, ours = Adam(lr=0.0, epsilon=1e-15), adam.LeanAdam(lr=0.0, epsilon=1e-15)
     for name, value in values.items():
-        plain[name] = value
-        plain.set_learning_rate({name: RATES[name]})
+        for optimizer in (plain, ours):
+            optimizer[name] = value
+            optimizer.set_learning_rate({name: RATES[name]})
     for seed in range(2):
         former = dict(ours.items())
         for optimizer in (plain, ours):
