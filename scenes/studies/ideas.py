@@ -38,7 +38,7 @@ from drgs.cli.execution import select_variant
 from drgs.config.changes import with_changes
 from drgs.config.load import load_config
 from drgs.config.schema import FitConfig
-from drgs.core.adam import LeanAdam
+from drgs.core.adam import LeanAdam, NesterovAdam
 from drgs.core.constants import SH_C0
 from drgs.core.types import Float, UInt32
 from drgs.datasets import load_dataset
@@ -400,7 +400,7 @@ class StepChange(Change):
     def attach(self, trainer: Trainer) -> None:
         change = self
 
-        class Changed(LeanAdam):
+        class Changed(NesterovAdam):
             def _update(self, key: str, rates: object) -> list[dr.ArrayBase]:
                 if key not in change.names:
                     return super()._update(key, rates)
@@ -427,6 +427,38 @@ def flat(value: dr.ArrayBase) -> Float:
 def like(value: dr.ArrayBase, numbers: Float) -> dr.ArrayBase:
     """Return ``numbers`` in the shape of ``value``."""
     return type(value)(numbers, value.shape) if dr.is_tensor_v(value) else type(value)(numbers)
+
+
+class AdamsMomentum(Change):
+    """Steps along the first moment as it is."""
+
+    @override
+    def attach(self, trainer: Trainer) -> None:
+        trainer.optimizer.__class__ = LeanAdam
+
+
+@dataclass(frozen=True)
+class FartherAhead(StepChange):
+    """Steps along the first moment after further steps with the same gradient, to first order."""
+
+    steps: float  # besides that of Nesterov's momentum
+
+    @override
+    def changed(self, trainer: Trainer, name: str, old: State, new: State, grad: Float) -> State:
+        beta = trainer.optimizer.beta_1
+        ahead = beta * new.first + (1 - beta) * grad
+        farther = 1 + self.steps * (1 - beta) * (grad - new.first) / ahead
+        factor = dr.select(dr.abs(ahead) > 1e-30, farther, 1)
+        return replace(new, value=old.value + factor * (new.value - old.value))
+
+
+class CautiousSteps(StepChange):
+    """No step of a number whose gradient has the opposite sign (Liang et al. 2024)."""
+
+    @override
+    def changed(self, trainer: Trainer, name: str, old: State, new: State, grad: Float) -> State:
+        is_downhill = (new.value - old.value) * grad <= 0
+        return replace(new, value=dr.select(is_downhill, new.value, old.value))
 
 
 class UnseenRowsRest(StepChange):
@@ -495,7 +527,7 @@ class HarmonicsInTurns(Change):
 
     @override
     def attach(self, trainer: Trainer) -> None:
-        class Changed(LeanAdam):
+        class Changed(NesterovAdam):
             def _update(self, key: str, rates: object) -> list[dr.ArrayBase]:
                 is_due = dr.grad_enabled(self.state[key][0])
                 return super()._update(key, rates) if is_due else []
@@ -765,12 +797,28 @@ class SmallAndTransparent(LossTerm):
         return (0.005 * transparency + 0.005 * dr.sum(scales)) / num_rows
 
 
+@dataclass(frozen=True)
+class SmallHarmonics(LossTerm):
+    """Mean over the Gaussians of the sum of squares of the harmonics above degree 0, weighted."""
+
+    weight: float
+
+    @override
+    def of_gaussians(self, parameters: Mapping[str, dr.ArrayBase], num_rows: int) -> Float | None:
+        if "shN" not in parameters:
+            return None
+        return self.weight * dr.sum(dr.square(parameters["shN"].array)) / num_rows
+
+
+@dataclass(frozen=True)
 class OtherTerms(Change):
-    """Further terms of the loss."""
+    """A further term of the loss."""
+
+    term: LossTerm = field(default_factory=SmallAndTransparent)
 
     @override
     def attach(self, trainer: Trainer) -> None:
-        trainer.terms = [*trainer.terms, SmallAndTransparent()]
+        trainer.terms = [*trainer.terms, self.term]
 
 
 # ----------------------------------------------------------------------------------------------
@@ -982,6 +1030,38 @@ IDEAS = (
         "no better on the whole; needs kernels of its own to save time",
         scenes=(*ALL, ROOM),
     ),
+    # Harmonics and steps.
+    Idea(
+        "a degree of harmonics more every 15 % of the iterations, not 2.5 %",
+        Given({"model.sh_increase_every": ITERATIONS // 40}),
+        "early harmonics learn noise",
+        is_kept=True,
+        scenes=WITH_MADE,
+    ),
+    Idea(
+        "... every 20 %",
+        Given({"model.sh_increase_every": ITERATIONS // 5}),
+        "no better",
+        scenes=ALL,
+    ),
+    Idea("Nesterov's momentum", AdamsMomentum(), "moves sooner", is_kept=True, scenes=WITH_MADE),
+    Idea("... one step farther ahead", FartherAhead(1), "no better", scenes=(LEGO, HEAD)),
+    Idea("cautious steps", CautiousSteps(), "worse", scenes=(SHIPPED,)),
+    Idea("beta_2 of 0.99", Given({"optimizer.beta_2": 0.99}), "no better", scenes=(SHIPPED,)),
+    Idea("beta_1 of 0.95", Given({"optimizer.beta_1": 0.95}), "no better", scenes=(SHIPPED,)),
+    Idea(
+        "harmonics' squares in the loss, times 0.01",
+        OtherTerms(SmallHarmonics(0.01)),
+        "harms the robot head",
+        scenes=(*PHOTOGRAPHS, ROOM),
+    ),
+    Idea(
+        "harmonics at a quarter of the rate",
+        Given({"optimizer.shN_lr": 2.5e-4}),
+        "harms the robot head",
+        scenes=(*PHOTOGRAPHS, ROOM),
+    ),
+    Idea("a smoothing filter", Given({"model.smoothing": True}), "no better", scenes=(ROOM,)),
 )
 
 
