@@ -43,14 +43,15 @@ def main() -> None:
         return
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--data", type=Path, required=True, help="folder of the scenes")
-    parser.add_argument("--environment", type=Path, help="make a virtual environment here, first")
+    parser.add_argument("--environment", type=Path, help="make a virtual environment here")
     parser.add_argument("--iterations", type=int, default=600, help="of a fit")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--lpips", action="store_true", help="measure it, too")
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
     parser.add_argument("--record", type=Path, default=RECORD)
     options = parser.parse_args()
-    if options.environment is not None:
+    options.environment = options.environment and options.environment.absolute()
+    if options.environment not in (None, Path(sys.prefix)):
         start_in_environment(options.environment)
     os.environ["CHECK_THREADS"] = str(options.threads)
     os.environ["CHECK_LPIPS"] = "1" if options.lpips else ""
@@ -74,9 +75,7 @@ def start_in_environment(folder: Path) -> None:
         subprocess.run(
             [python, "-m", "pip", "install", NERFBASELINES, "-e", f"{REPOSITORY}[llvm]"], check=True
         )
-    words = iter(sys.argv)
-    kept = [w for w in words if w != "--environment" or not next(words)]
-    os.execv(python, [str(python), *kept])
+    os.execv(python, [str(python), *sys.argv])
 
 
 def set_threads() -> None:
