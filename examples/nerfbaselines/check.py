@@ -1,11 +1,11 @@
-"""Checks of the method drgs of nerfbaselines; writes what they gave to RECORD.md.
+"""Checks of the method drgs of nerfbaselines; prints a page of what they gave.
 
     python examples/nerfbaselines/check.py --data DIR [--environment DIR]
 
 In an environment with nerfbaselines and drgs, or a new one in ``--environment``, it runs
 nerfbaselines' test of a method and a short fit on each scene in DIR: ``nerf_synthetic/lego``,
 ``fox`` and ``colmap_robothead``. It then measures the fitted Gaussians by drgs, whose readers and
-scores share no code with those of nerfbaselines, and explains the differences.
+scores share no code with those of nerfbaselines. ``RECORD.md`` has figures, and explains them.
 
 LPIPS is left out unless ``--lpips`` is given: it takes PyTorch, and weights from the internet.
 """
@@ -30,7 +30,6 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parents[1]
 METHOD = HERE / "drgs_method.py"
-RECORD = HERE / "RECORD.md"
 NERFBASELINES = "nerfbaselines==1.2.0"
 BORDER_PX = 5  # half of the window of SSIM
 COLOR_CODES = re.compile(r"\x1b\[[0-9;]*m")
@@ -48,7 +47,6 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--lpips", action="store_true", help="measure it, too")
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
-    parser.add_argument("--record", type=Path, default=RECORD)
     options = parser.parse_args()
     options.environment = options.environment and options.environment.absolute()
     if options.environment not in (None, Path(sys.prefix)):
@@ -56,14 +54,13 @@ def main() -> None:
     os.environ["CHECK_THREADS"] = str(options.threads)
     os.environ["CHECK_LPIPS"] = "1" if options.lpips else ""
     set_threads()
-    sections = []
+    print(make_header(options))
     with tempfile.TemporaryDirectory() as folder:
         for name in options.scenes:
             data = Path(folder) / name
             data.mkdir()
             SCENES[name](options.data.resolve(), data)
-            sections.append(check_scene(name, data, options.iterations))
-            options.record.write_text(make_record(sections, options))
+            print(check_scene(name, data, options.iterations), flush=True)
 
 
 def start_in_environment(folder: Path) -> None:
@@ -279,22 +276,14 @@ def score_of_own_fit(data: Path, iterations: int) -> Row:
     return "another fit, by `drgs.train`: drgs' own scores", quality.psnr, quality.ssim
 
 
-def make_record(sections: Sequence[str], options: argparse.Namespace) -> str:
-    """Return the record of all checks."""
+def make_header(options: argparse.Namespace) -> str:
+    """Return the beginning of the page: versions, machine, and how to read the tables."""
     packages = ("nerfbaselines", "drgs", "mitsuba", "drjit", "numpy")
     versions = ", ".join(f"{name} {version(name)}" for name in packages)
-    describe = ["git", "-C", str(REPOSITORY), "describe", "--always", "--dirty"]
-    commit = subprocess.run(describe, stdout=subprocess.PIPE, text=True).stdout.strip()
-    return "\n".join(
-        [
-            "# Record\n",
-            "Written by `check.py`, and not by hand; its docstring tells how to run it. Scores are "
-            "means over test views.\n",
-            f"- {time.strftime('%Y-%m-%d')}, commit {commit}, Python {platform.python_version()}, "
-            f"{versions}",
-            f"- {processor()}, {options.threads} thread(s) of Dr.Jit\n",
-            *sections,
-        ]
+    return (
+        f"{time.strftime('%Y-%m-%d')}, {versions}, Python {platform.python_version()}, "
+        f"{processor()}, {options.threads} thread(s) of Dr.Jit. Scores are means over test views; "
+        "each row of a table differs from the one above it in what it names.\n"
     )
 
 
