@@ -83,10 +83,12 @@ def method_module(registered):
     stub.Method, stub.MethodInfo, stub.ModelInfo = object, dict, dict
     stub.camera_model_from_int = CAMERA_MODELS.__getitem__
     stub.register = registered.append
-    with mock.patch.dict(sys.modules, {"nerfbaselines": stub}):
-        sys.modules.pop("drgs_method", None)
-        with mock.patch.object(sys, "path", [str(FOLDER), *sys.path]):
-            yield importlib.import_module("drgs_method")
+    with pytest.MonkeyPatch.context() as patch:  # of these names alone: drgs' modules stay
+        patch.setitem(sys.modules, "nerfbaselines", stub)
+        patch.syspath_prepend(FOLDER)
+        patch.delitem(sys.modules, "drgs_method", raising=False)
+        yield importlib.import_module("drgs_method")
+    del sys.modules["drgs_method"]
 
 
 def test_the_file_registers_itself_where_it_is_not_imported(registered, method_module):
