@@ -75,12 +75,8 @@ def _add_cameras(parser: CommandParser) -> None:
         help="where they stand (default: where the scene's sensors are, if there are "
         f"{ENOUGH_SENSORS} or more; else around it)",
     )
-    add(
-        "--fov",
-        type=degrees,
-        metavar="DEGREES",
-        help="horizontal field of view (default: the original's 39.6)",
-    )
+    fov = "horizontal field of view (default: the original's 39.6)"
+    add("--fov", type=degrees, metavar="DEGREES", help=fov)
     add(
         "--distance",
         type=finite_number,
@@ -106,7 +102,10 @@ def _add_cameras(parser: CommandParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Capture the scene that the command line names."""
-    given = _given_settings(args)
+    options = {field.name: getattr(args, field.name) for field in fields(CaptureSettings)}
+    given = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items() if v is not None}
+    if args.fov is not None:
+        given["fov"] = math.radians(args.fov)
     settings = replace(CaptureSettings(), **given)
     if reason := too_large_reason(*settings.size):
         raise UserError(f"--size: {reason}")
@@ -132,14 +131,6 @@ def run(args: argparse.Namespace) -> None:
         except KeyboardInterrupt:
             print("\nthe same command continues", file=sys.stderr)
             raise
-
-
-def _given_settings(args: argparse.Namespace) -> dict[str, object]:
-    options = {field.name: getattr(args, field.name) for field in fields(CaptureSettings)}
-    given = {name: value for name, value in options.items() if value is not None}
-    if args.fov is not None:
-        given["fov"] = math.radians(args.fov)
-    return {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
 
 
 main = partial(run_command, add_arguments, "python -m drgs.capture")

@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     import numpy as np
 
 _REMEDIES = {
-    errno.ENOSPC: "free some space, or choose another disk",
-    errno.EDQUOT: "free some space, or choose another disk",
-    errno.EACCES: "choose a folder that you may write to",
-    errno.EPERM: "choose a folder that you may write to",
-    errno.EROFS: "choose a folder that you may write to",
-    errno.ENOTDIR: "choose another folder: a part of this path is a file",
-    errno.EEXIST: "choose another folder: a part of this path is a file",
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space, or choose another disk"),
+    **dict.fromkeys(
+        (errno.EACCES, errno.EPERM, errno.EROFS), "choose a folder that you may write to"
+    ),
+    **dict.fromkeys(
+        (errno.ENOTDIR, errno.EEXIST), "choose another folder: a part of this path is a file"
+    ),
     errno.EISDIR: "remove or rename the folder of this name",
     errno.ENAMETOOLONG: "choose a shorter name",
 }
