@@ -278,9 +278,8 @@ def use_activated(rows: GaussianRows) -> GaussianRows:
     t = types_of(type(rows.logit_opacities))
     sizes = [dr.abs(scale) for scale in rows.features["scales"]]
     logs = [dr.log(dr.select(size > MIN_SCALE, size, MIN_SCALE)) for size in sizes]
-    return replace(
-        rows, log_scales=t.Array3f(logs), opacity_compensation=rows.features["opacities"][0]
-    )
+    compensation = rows.features["opacities"][0]
+    return replace(rows, log_scales=t.Array3f(logs), opacity_compensation=compensation)
 
 
 @dataclass(frozen=True)
@@ -401,9 +400,8 @@ class _View:
     def gradients(self, d_planes: list[Float]) -> dict[str, TensorXf | Float]:
         """Return gradients of the inputs from those of the planes."""
         dr.eval(d_planes)
-        adjoint = frames_adjoint(
-            self.gaussians, [self.frame], [d_planes], self.film.is_camera_attached
-        )
+        with_camera = self.film.is_camera_attached
+        adjoint = frames_adjoint(self.gaussians, [self.frame], [d_planes], with_camera)
         d, t = adjoint.parameters, self.types
         assert d is not None and d.features is not None, "of self.gaussians, projected here"
         gradients: dict[str, TensorXf | Float] = {

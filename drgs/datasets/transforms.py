@@ -228,9 +228,8 @@ class TransformsFrame:
             values |= {"cx": principal[0], "cy": principal[1]}
         values |= {"transform_matrix": opengl.tolist()}
         checked = validate(FrameValues, values, f"{source}: frame {index}: ")
-        return TransformsFrame(
-            checked, source, f"frames[{index}].", files={"image": image, **files}
-        )
+        found = {"image": image, **files}
+        return TransformsFrame(checked, source, f"frames[{index}].", files=found)
 
     @property
     def file_path(self) -> str:

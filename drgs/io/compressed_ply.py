@@ -112,12 +112,8 @@ class CompressedPly(FileFormat):
             "packed_color": colors_from_sh0(g["sh0"]),
         }
         starts = np.arange(0, len(order), CHUNK)  # of groups; their bounds are (C, 3) float32
-        bounds = {
-            name: [
-                side.reduceat(v, starts, axis=0).astype("<f4") for side in (np.minimum, np.maximum)
-            ]
-            for name, v in values.items()
-        }
+        ends = np.minimum.reduceat, np.maximum.reduceat
+        bounds = {k: [end(v, starts).astype("<f4") for end in ends] for k, v in values.items()}
         parts = {name: _parts(v, *bounds[name]) for name, v in values.items()}
         opacities = opacities_from_logits(g["logit_opacities"])
         parts["packed_color"] = np.column_stack([parts["packed_color"], opacities])
