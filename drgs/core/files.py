@@ -25,11 +25,11 @@ from drgs.core.memory import require_memory
 if TYPE_CHECKING:
     import numpy as np
 
-_READ_ONLY, _HAS_FILE = (errno.EACCES, errno.EPERM, errno.EROFS), (errno.ENOTDIR, errno.EEXIST)
+_DENIED, _BLOCKED = (errno.EACCES, errno.EPERM, errno.EROFS), (errno.ENOTDIR, errno.EEXIST)
 _REMEDIES = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space, or choose another disk"),
-    **dict.fromkeys(_READ_ONLY, "choose a folder that you may write to"),
-    **dict.fromkeys(_HAS_FILE, "choose another folder: a part of this path is a file"),
+    **dict.fromkeys(_DENIED, "choose a folder that you may write to"),
+    **dict.fromkeys(_BLOCKED, "choose another folder: a part of this path is a file"),
     errno.EISDIR: "remove or rename the folder of this name",
     errno.ENAMETOOLONG: "choose a shorter name",
 }

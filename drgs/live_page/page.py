@@ -161,9 +161,9 @@ class CameraControls:
         width, height = (max(1, round(scale * side)) for side in size)
         names = VIEWER_LENSES[lens].parameters
         parameters = {name: float(self._lens_sliders[name].value) for name in names}
-        view = ViewerCamera(pose, fov, distance), width, height
-        how = self._content.value, self._approximations()
-        return FrameRequest(*view, lens, parameters, *how)
+        view, content = ViewerCamera(pose, fov, distance), self._content.value
+        how = self._approximations()
+        return FrameRequest(view, width, height, lens, parameters, content, how)
 
     def _approximations(self) -> Approximations:
         values = {name: getattr(self._fitted, name) for name in DECLARED}

@@ -18,10 +18,9 @@ UP = (0.0, 0.0, 1.0)  # world: the convention of both dataset layouts
 
 def add_background(parser: argparse._ActionsContainer) -> None:
     """Add the argument for :func:`parse_background`."""
-    text = "white, black, R G B in 0..1, or an image file (default: that of the configuration, or "
-    parser.add_argument(
-        "--background", nargs="+", metavar="COLOR", help=f"{text}black without one)"
-    )
+    text = "white, black, R G B in 0..1, or an image file (default: that of the configuration, "
+    text += "or black without one)"
+    parser.add_argument("--background", nargs="+", metavar="COLOR", help=text)
 
 
 def add_error(parser: argparse._ActionsContainer) -> None:
