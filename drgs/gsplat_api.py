@@ -242,7 +242,12 @@ def _check_shapes(inputs: Mapping[str, TensorXf], sh_degree: int | None) -> None
         is_sh = name == "colors" and sh_degree is not None
         allowed = COEFFICIENTS if is_sh else SHAPES[name]
         shapes = [tuple(sizes.get(each, each) for each in letters) for letters in allowed]
-        fitting = [k for k, shape in enumerate(shapes) if _fits(value.shape, shape)]
+        fitting = [
+            k
+            for k, shape in enumerate(shapes)
+            if len(value.shape) == len(shape)
+            and all(isinstance(n, str) or n == m for n, m in zip(shape, value.shape, strict=True))
+        ]
         expected = " or ".join(str(shape).replace("'", "") for shape in shapes)
         _require(bool(fitting), name, f"of shape {expected}", value.shape)
         _require(value.shape[0] >= 1, name, "of one row at least", value.shape)
@@ -253,13 +258,6 @@ def _check_shapes(inputs: Mapping[str, TensorXf], sh_degree: int | None) -> None
             _require(sizes["K"] >= least, name, expected, sizes["K"])
     expected = f"of at most {MAX_FEATURES} channels"
     _require(sizes["D"] <= MAX_FEATURES, "colors", expected, sizes["D"])
-
-
-def _fits(got: tuple[int, ...], shape: tuple[int | str, ...]) -> bool:
-    return len(got) == len(shape) and all(
-        isinstance(wanted, str) or number == wanted
-        for number, wanted in zip(got, shape, strict=True)
-    )
 
 
 def _check_cameras(viewmats: np.ndarray, Ks: np.ndarray) -> None:
@@ -280,9 +278,8 @@ def use_activated(rows: GaussianRows) -> GaussianRows:
     t = types_of(type(rows.logit_opacities))
     sizes = [dr.abs(scale) for scale in rows.features["scales"]]
     logs = [dr.log(dr.select(size > MIN_SCALE, size, MIN_SCALE)) for size in sizes]
-    return replace(
-        rows, log_scales=t.Array3f(logs), opacity_compensation=rows.features["opacities"][0]
-    )
+    compensation = rows.features["opacities"][0]
+    return replace(rows, log_scales=t.Array3f(logs), opacity_compensation=compensation)
 
 
 @dataclass(frozen=True)
@@ -403,9 +400,8 @@ class _View:
     def gradients(self, d_planes: list[Float]) -> dict[str, TensorXf | Float]:
         """Return gradients of the inputs from those of the planes."""
         dr.eval(d_planes)
-        adjoint = frames_adjoint(
-            self.gaussians, [self.frame], [d_planes], self.film.is_camera_attached
-        )
+        with_camera = self.film.is_camera_attached
+        adjoint = frames_adjoint(self.gaussians, [self.frame], [d_planes], with_camera)
         d, t = adjoint.parameters, self.types
         assert d is not None and d.features is not None, "of self.gaussians, projected here"
         gradients: dict[str, TensorXf | Float] = {

@@ -349,16 +349,14 @@ def bytes_are_reproducible(case: Case) -> None:
 def single_precision_is_accurate(case: Case) -> None:
     """Image and gradients in single precision are within ``single_tolerance`` of double."""
     weights, kept = _weights(case), ~case.near_threshold
-    pairs = {
-        "image": (case.planes(case.values, llvm.Float)[:, kept], case.planes(case.values)[:, kept])
-    }
+    planes = case.planes(case.values, llvm.Float), case.planes(case.values)
+    pairs = {"image": (planes[0][:, kept], planes[1][:, kept])}
     precise = case.gradients(case.values, weights)
     rounded = case.gradients(case.values, weights, llvm.Float)
     pairs |= {name: (rounded[name], precise[name]) for name in PARAMETER_NAMES}
     for name, (actual, expected) in pairs.items():
-        error = np.abs(actual - expected).max(initial=0) / max(
-            np.abs(expected).max(initial=0), 1e-300
-        )
+        largest = max(np.abs(expected).max(initial=0), 1e-300)
+        error = np.abs(actual - expected).max(initial=0) / largest
         assert error <= case.single_tolerance, f"{case.name}: {name} is off by {error:.1e}"
 
 
@@ -375,9 +373,8 @@ def jacobian_equals_differences(case: Case) -> None:
         differences.append(found)
         error = np.maximum(error, np.abs(found - [np.array(dr.dot(row, world)) for row in rows]))
     worst = (error.max(0) / np.abs(differences).max((0, 1))).max()
-    assert worst <= case.gradient_tolerance, (
-        f"{case.name}: projection_jacobian is off by {worst:.1e}"
-    )
+    words = f"{case.name}: projection_jacobian is off by {worst:.1e}"
+    assert worst <= case.gradient_tolerance, words
 
 
 def rays_meet_their_points(case: Case) -> None:
@@ -388,15 +385,13 @@ def rays_meet_their_points(case: Case) -> None:
     direction = dr.normalize(lens.ray(camera, place.x, place.y))
     way = points - lens.origin(camera, place.x, place.y)
     worst = np.max(np.array(dr.norm(way / dr.norm(way) - direction)))
-    assert worst <= MAX_RAY_ERROR, (
-        f"{case.name}: ray misses points by {worst:.1e} of their distance"
-    )
+    words = f"{case.name}: ray misses points by {worst:.1e} of their distance"
+    assert worst <= MAX_RAY_ERROR, words
     y, x = np.mgrid[: case.height, : case.width].reshape(2, -1) + 0.5
     place: Any = llvm.Array2f64(x, y)
     ray = lens.ray(camera, place.x, place.y)
-    meets = (
-        dr.norm(lens.place_of_ray(camera, lens.origin(camera, *place), ray) - place) < 1e-6
-    )  # px
+    missed = lens.place_of_ray(camera, lens.origin(camera, *place), ray) - place
+    meets = dr.norm(missed) < 1e-6  # px
     shown, _, _ = lens.visibility(replace(camera, near=llvm.Float64(0)), ray)
     assert dr.all(~meets | shown), f"{case.name}: shows is false for rays of the film"
 

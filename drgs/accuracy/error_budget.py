@@ -299,7 +299,12 @@ class Search:
 
         least: budget below which none is asked for, so that orders need not be more accurate.
         """
-        check_no_extensions(renderer.given)
+        for registry in (PROJECTIONS, FALLOFFS, ORDERS):
+            if (value := getattr(renderer.given, registry.kind)) not in registry.shipped_names:
+                raise ValueError(
+                    f"cannot be met with the {registry.kind} '{value}', which is not drgs's own: "
+                    "what is accurate, is not known; leave one of them out"
+                )
         self._renderer = renderer
         pixels = [camera.width * camera.height for camera in cameras]
         places = measured_places(len(cameras), max(pixels))
@@ -473,13 +478,3 @@ class Search:
                 raise ValueError(
                     f"{budget:.2g} cannot be met here: the most accurate choice is within {least:g}"
                 )
-
-
-def check_no_extensions(given: Approximations) -> None:
-    """Raise ValueError for a projection, falloff or order of another package."""
-    for registry in (PROJECTIONS, FALLOFFS, ORDERS):
-        if (value := getattr(given, registry.kind)) not in registry.shipped_names:
-            raise ValueError(
-                f"cannot be met with the {registry.kind} '{value}', which is not drgs's own: what "
-                "is accurate, is not known; leave one of them out"
-            )

@@ -6,9 +6,8 @@ from functools import partial
 
 from drgs.cli.commands import CommandParser, Subcommand, run_command
 
-COMMANDS = {
-    "speed": "times of drgs and of other renderers on the same scene, in one run"
-}  # descriptions by module
+# Descriptions by module.
+COMMANDS = {"speed": "times of drgs and of other renderers on the same scene, in one run"}
 
 
 def add_arguments(parser: CommandParser) -> None:

@@ -27,13 +27,8 @@ def add_out(
 
     Raises UserError before measuring if a file there was not written by a measurement.
     """
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/bench"),
-        metavar="DIR",
-        help="output folder (default: out/bench)",
-    )
+    text, folder = "output folder (default: out/bench)", Path("out/bench")
+    parser.add_argument("--out", type=Path, default=folder, metavar="DIR", help=text)
 
     def run_and_record(args: argparse.Namespace) -> None:
         FolderRecord(args.out, COMMAND).claim(names)

@@ -52,18 +52,11 @@ def add_arguments(parser: CommandParser) -> None:
     parser.show_examples("%(prog)s --trained out/lego/point_cloud.ply")
     add_out(parser, run, "speed.csv", "speed.png")
     parser.add_argument("--quick", action="store_true", help="10,000 Gaussians only; two minutes")
-    parser.add_argument(
-        "--without-avx512",
-        action="store_true",
-        help="compile for AVX2; only where Dr.Jit uses AVX-512",
-    )
-    parser.add_argument(
-        "--trained",
-        type=Path,
-        default=Path("out/lego") / GAUSSIANS,
-        metavar="PLY",
-        help="also measure this fitted scene (default: out/lego/point_cloud.ply, if it exists)",
-    )
+    text = "compile for AVX2; only where Dr.Jit uses AVX-512"
+    parser.add_argument("--without-avx512", action="store_true", help=text)
+    text = "also measure this fitted scene (default: out/lego/point_cloud.ply, if it exists)"
+    path = Path("out/lego") / GAUSSIANS
+    parser.add_argument("--trained", type=Path, default=path, metavar="PLY", help=text)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -65,48 +65,31 @@ def add_arguments(parser: CommandParser) -> None:
 
 
 def _add_cameras(parser: CommandParser) -> None:
-    group = parser.add_argument_group(
-        "cameras", "What is not given follows from the scene's own sensors, if it has any."
-    )
-    add = group.add_argument
-    add(
-        "--cameras",
-        choices=KINDS,
-        help="where they stand (default: where the scene's sensors are, if there are "
-        f"{ENOUGH_SENSORS} or more; else around it)",
-    )
-    add(
-        "--fov",
-        type=degrees,
-        metavar="DEGREES",
-        help="horizontal field of view (default: the original's 39.6)",
-    )
-    add(
-        "--distance",
-        type=finite_number,
-        help="of the cameras from the target (default: the whole scene is in the image)",
-    )
+    text = "What is not given follows from the scene's own sensors, if it has any."
+    add = parser.add_argument_group("cameras", text).add_argument
+    where = "where they stand (default: where the scene's sensors are, if there are "
+    where += f"{ENOUGH_SENSORS} or more; else around it)"
+    add("--cameras", choices=KINDS, help=where)
+    fov = "horizontal field of view (default: the original's 39.6)"
+    add("--fov", type=degrees, metavar="DEGREES", help=fov)
+    distance = "of the cameras from the target (default: the whole scene is in the image)"
+    add("--distance", type=finite_number, help=distance)
     what = "what the cameras look at (default: the middle of the bounding box)"
     add("--target", **VECTOR, help=what)
-    add(
-        "--up",
-        choices=("x", "y", "z", "-x", "-y", "-z"),
-        metavar="AXIS",
-        help="x, y, z or, as in --up=-z, an opposite (default: z)",
-    )
+    axes, up = ("x", "y", "z", "-x", "-y", "-z"), "x, y, z or, as in --up=-z, an opposite"
+    add("--up", choices=axes, metavar="AXIS", help=f"{up} (default: z)")
     ranges = {"type": finite_number, "nargs": 2, "metavar": ("MIN", "MAX")}
-    add(
-        "--azimuth",
-        **ranges,
-        help="degrees about the up axis, from the axis that follows it in x, y, z, x (default: "
-        "all around)",
-    )
+    azimuth = "degrees about the up axis, from the axis that follows it in x, y, z, x"
+    add("--azimuth", **ranges, help=f"{azimuth} (default: all around)")
     add("--elevation", **ranges, help="degrees above the horizon (default: 0 90)")
 
 
 def run(args: argparse.Namespace) -> None:
     """Capture the scene that the command line names."""
-    given = _given_settings(args)
+    options = {field.name: getattr(args, field.name) for field in fields(CaptureSettings)}
+    given = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items() if v is not None}
+    if args.fov is not None:
+        given["fov"] = math.radians(args.fov)
     settings = replace(CaptureSettings(), **given)
     if reason := too_large_reason(*settings.size):
         raise UserError(f"--size: {reason}")
@@ -121,9 +104,8 @@ def run(args: argparse.Namespace) -> None:
     with sole_writer(args.out) as keep:
         folder = CaptureFolder(args.out, args.scene, settings, keep)
         folder.check()
-        kind = (
-            f"{len(views)} around the scene, field of view {math.degrees(settings.fov):.4g} degrees"
-        )
+        fov = f"field of view {math.degrees(settings.fov):.4g} degrees"
+        kind = f"{len(views)} around the scene, {fov}"
         kind = f"the scene's own sensors, {len(views)}" if settings.cameras == "sensors" else kind
         print(f"cameras: {kind}")
         try:
@@ -132,14 +114,6 @@ def run(args: argparse.Namespace) -> None:
         except KeyboardInterrupt:
             print("\nthe same command continues", file=sys.stderr)
             raise
-
-
-def _given_settings(args: argparse.Namespace) -> dict[str, object]:
-    options = {field.name: getattr(args, field.name) for field in fields(CaptureSettings)}
-    given = {name: value for name, value in options.items() if value is not None}
-    if args.fov is not None:
-        given["fov"] = math.radians(args.fov)
-    return {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
 
 
 main = partial(run_command, add_arguments, "python -m drgs.capture")

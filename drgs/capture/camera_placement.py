@@ -65,7 +65,13 @@ def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) ->
         for name in sorted(given & NOT_OF_SENSORS):
             option = f"--{name.replace('_', '-')}"
             raise UserError(f"{option}: is not used with --cameras sensors; leave it out")
-        derived = _sensor_settings(sensors)
+        if not sensors:
+            raise UserError(
+                "--cameras sensors: the scene has no sensor of type perspective or thinlens; leave "
+                "the option out"
+            )
+        tests = len(sensors[::TEST_EVERY]) if len(sensors) > 1 else 0
+        derived = {"views": len(sensors) - tests, "val_views": 0, "test_views": tests}
     else:
         derived = _around_settings(scene, settings, given, sensors) if sensors else {}
     return replace(settings, **{name: derived[name] for name in derived.keys() - given})
@@ -74,7 +80,14 @@ def settings_for(scene: mi.Scene, settings: CaptureSettings, given: Set[str]) ->
 def views_of(scene: mi.Scene, settings: CaptureSettings) -> list[CaptureView]:
     """Return all views, split after split; settings: from :func:`settings_for`."""
     if settings.cameras == "sensors":
-        return views_of_sensors(perspective_sensors(scene), settings)
+        sensors = perspective_sensors(scene)
+        tests = sensors[::TEST_EVERY] if settings.test_views > 0 else []
+        train = [o for n, o in enumerate(sensors) if not tests or n % TEST_EVERY]
+        return [
+            CaptureView(split, index, o.pose, _fov(settings, o.narrower_fov))
+            for split, cameras in (("train", train), ("test", tests))
+            for index, o in enumerate(cameras)
+        ]
     return views_around(settings, *target_and_distance(scene, settings))
 
 
@@ -88,30 +101,15 @@ def _around_settings(
     middle = np.mean(bounding_box(scene), axis=0, dtype=np.float64)
     ahead = [(o.pose[:3, 3], -o.pose[:3, 2]) for o in sensors]
     aims = [c + ((middle - c) @ axis) * axis for c, axis in ahead if (middle - c) @ axis > 0]
-    up = _up_axis(sensors)
+    mean_up = np.mean([o.pose[:3, 1] for o in sensors], axis=0)
+    axis = int(np.argmax(np.abs(mean_up)))  # the nearest to up in the sensors' images
+    up = f"{'-' if mean_up[axis] < 0 else ''}{'xyz'[axis]}"
     if not aims or given & {"fov", "distance"}:
         return {"up": up}
     target = np.mean(aims, axis=0) if settings.target is None else np.array(settings.target)
     distance = float(np.median([np.linalg.norm(o.pose[:3, 3] - target) for o in sensors]))
     fov = _fov(settings, float(np.median([o.narrower_fov for o in sensors])))
     return {"up": up, "target": tuple(target.tolist()), "distance": distance, "fov": fov}
-
-
-def _sensor_settings(sensors: list[SceneSensor]) -> dict[str, object]:
-    if not sensors:
-        raise UserError(
-            "--cameras sensors: the scene has no sensor of type perspective or thinlens; leave the "
-            "option out"
-        )
-    tests = len(sensors[::TEST_EVERY]) if len(sensors) > 1 else 0
-    return {"views": len(sensors) - tests, "val_views": 0, "test_views": tests}
-
-
-def _up_axis(sensors: list[SceneSensor]) -> str:
-    """Return the axis that is nearest to up in the sensors' images, such as ``z`` or ``-y``."""
-    up = np.mean([o.pose[:3, 1] for o in sensors], axis=0)
-    axis = int(np.argmax(np.abs(up)))
-    return f"{'-' if up[axis] < 0 else ''}{'xyz'[axis]}"
 
 
 def _fov(settings: CaptureSettings, narrower: float) -> float:
@@ -151,18 +149,6 @@ def views_around(
             pose = look_at(target + offset, target, up) @ OPENCV_TO_OPENGL
             views.append(CaptureView(split, index, pose, settings.fov))
     return views
-
-
-def views_of_sensors(sensors: list[SceneSensor], settings: CaptureSettings) -> list[CaptureView]:
-    """Return the views of the scene's own sensors."""
-    has_tests = settings.test_views > 0
-    tests = sensors[::TEST_EVERY] if has_tests else []
-    train = [o for n, o in enumerate(sensors) if not (has_tests and n % TEST_EVERY == 0)]
-    return [
-        CaptureView(split, index, o.pose, _fov(settings, o.narrower_fov))
-        for split, cameras in (("train", train), ("test", tests))
-        for index, o in enumerate(cameras)
-    ]
 
 
 def remap_to_ranges(directions: np.ndarray, settings: CaptureSettings) -> np.ndarray:

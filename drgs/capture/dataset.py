@@ -125,7 +125,8 @@ class CaptureFolder:
                 if not shown:  # until now, the scene may have been refused
                     self.claim()
                 write_png(self.image_path(view), image)
-                shown.append(shows_something(image))
+                is_covered = (image[:, :, 3] > 0).mean() >= MIN_COVERED_PART
+                shown.append(is_covered and lit_part(image) >= MIN_LIT_PART)
                 if len(shown) == num_first and sum(shown) < num_first / 2:
                     warning = (
                         f"warning: {num_first - sum(shown)} of the first {num_first} images are "
@@ -149,7 +150,13 @@ class CaptureFolder:
         for split in reversed(SPLITS):
             path = self.path / f"transforms_{split}.json"
             if settings.count(split) and not path.exists():
-                write_transforms(path, settings, [view for view in views if view.split == split])
+                frames = [
+                    {"file_path": view.file_path, "transform_matrix": view.pose.tolist()}
+                    | ({} if view.fov == settings.fov else {"camera_angle_x": view.fov})
+                    for view in views
+                    if view.split == split
+                ]
+                write_json(path, {"camera_angle_x": settings.fov, "frames": frames})
         counted = ", ".join(f"{settings.count(s)} {s}" for s in SPLITS if settings.count(s))
         width, height = settings.size
         print(f"written: {self.path}: {counted} views, {width}x{height}, {settings.spp} spp")
@@ -216,27 +223,9 @@ def spread_first(views: list[CaptureView]) -> list[CaptureView]:
     return [views[index] for index in (*chosen, *rest)]
 
 
-def shows_something(image: np.ndarray) -> bool:
-    """Return whether an image, (H, W, 4) uint8, is not empty, and most of its surfaces are lit."""
-    covered = float((image[:, :, 3] > 0).mean())
-    return covered >= MIN_COVERED_PART and lit_part(image) >= MIN_LIT_PART
-
-
-def write_transforms(path: Path, settings: CaptureSettings, views: list[CaptureView]) -> None:
-    """Write one ``transforms_*.json``."""
-    frames = [
-        {"file_path": view.file_path, "transform_matrix": view.pose.tolist()}
-        | ({} if view.fov == settings.fov else {"camera_angle_x": view.fov})
-        for view in views
-    ]
-    write_json(path, {"camera_angle_x": settings.fov, "frames": frames})
-
-
 def write_points(path: Path, positions: np.ndarray, colors: np.ndarray) -> None:
     """Write a PLY of points: positions (N, 3) world, colours (N, 3) uint8 display space."""
-    columns = dict(zip((*POSITION, *COLOR), (*positions.T, *colors.T), strict=True))
-    dtype = [(name, column.dtype) for name, column in columns.items()]
-    rows = np.rec.fromarrays(list(columns.values()), dtype=dtype)
+    rows = np.rec.fromarrays([*positions.T, *colors.T], names=[*POSITION, *COLOR])
     with atomic_path(path) as temporary:
         temporary.write_bytes(encode_elements({"vertex": rows}))
 

@@ -25,17 +25,10 @@ def add_execution_arguments(
 ) -> None:
     """Add ``--variant``, ``--threads`` and ``--debug``; variants: choices, None: any."""
     add_variant_argument(parser, variants)
-    parser.add_argument(
-        "--threads",
-        type=bounded_int(1, MAX_THREADS),
-        metavar="N",
-        help="number of CPU threads (default: one per core)",
-    )
-    parser.add_argument(
-        "--debug",
-        action="store_true",
-        help="check the bounds of every memory access, and stop at the first violation; slow",
-    )
+    text = "number of CPU threads (default: one per core)"
+    parser.add_argument("--threads", type=bounded_int(1, MAX_THREADS), metavar="N", help=text)
+    text = "check the bounds of every memory access, and stop at the first violation; slow"
+    parser.add_argument("--debug", action="store_true", help=text)
 
 
 def add_variant_argument(

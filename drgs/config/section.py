@@ -135,7 +135,11 @@ class ExtensibleSection(Section):
             return handler(values)
         known = {*cls.model_fields, *cls.removed}
         own = {key: value for key, value in values.items() if key in known}
-        others = {str(key): _to_mapping(values[key]) for key in values if key not in own}
+        others = {  # as a file has them; null is an empty section
+            str(key): section.model_dump() if isinstance(section, BaseModel) else section or {}
+            for key, section in values.items()
+            if key not in own
+        }
         extensions = [extension for name in others if (extension := cls.extension(name))]
         models: dict[str, Any] = {each.name: (each.section or Section, ...) for each in extensions}
         sections = create_model("Sections", __base__=_SectionsOfExtensions, **models)
@@ -152,11 +156,6 @@ class ExtensibleSection(Section):
         result.__pydantic_extra__.update({name: getattr(valid[1], name) for name in others})
         result.__pydantic_fields_set__.update(others)
         return result
-
-
-def _to_mapping(section: object) -> object:
-    """Return a section as a file has it; null is an empty one."""
-    return section.model_dump() if isinstance(section, BaseModel) else section or {}
 
 
 def _error_details(error: ErrorDetails) -> InitErrorDetails:

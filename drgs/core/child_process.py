@@ -87,7 +87,11 @@ def serve() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # libraries may print
     function, arguments, memory = pickle.load(sys.stdin.buffer)
     if memory is not None:
-        _limit_memory(memory)
+        with suppress(ImportError, OSError, ValueError):  # Windows; a lower limit of the user's
+            import resource
+
+            most = psutil.Process().memory_info().vms + memory
+            resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
     def end_with_parent() -> None:
         os.read(sys.stdin.fileno(), 1)  # until the parent, which holds the input open, ends
@@ -104,14 +108,6 @@ def serve() -> None:
         answer = "error", error
     _send(answers, answer)
     os._exit(0)  # without waiting for what the library does at its end
-
-
-def _limit_memory(memory: int) -> None:
-    with suppress(ImportError, OSError, ValueError):  # Windows; a lower limit of the user's
-        import resource
-
-        most = psutil.Process().memory_info().vms + memory
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
 def _send(stream: IO[bytes], message: object) -> None:

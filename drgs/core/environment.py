@@ -6,7 +6,7 @@ import ctypes
 import os
 import platform
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from types import ModuleType
 
@@ -73,21 +73,17 @@ def describe_installation() -> str:
 _FLUSH_BITS = 0x8040  # FTZ and DAZ of x86's MXCSR (Intel, Software Developer's Manual 1, 10.2.3)
 
 
-@contextmanager
-def denormals_flushed() -> Iterator[None]:
+def denormals_flushed() -> AbstractContextManager[None]:
     """Flush denormal numbers to zero on this thread, as on Dr.Jit's workers; glibc on x86-64 only.
 
     Else bits of a fit would depend on the number of threads: Dr.Jit runs small kernels here.
     """
-    with _mode(lambda bits: bits | _FLUSH_BITS):
-        yield
+    return _mode(lambda bits: bits | _FLUSH_BITS)
 
 
-@contextmanager
-def denormals_kept() -> Iterator[None]:
+def denormals_kept() -> AbstractContextManager[None]:
     """Keep denormal numbers on this thread within the block."""
-    with _mode(lambda bits: bits & ~_FLUSH_BITS):
-        yield
+    return _mode(lambda bits: bits & ~_FLUSH_BITS)
 
 
 @contextmanager

@@ -25,14 +25,11 @@ from drgs.core.memory import require_memory
 if TYPE_CHECKING:
     import numpy as np
 
+_DENIED, _BLOCKED = (errno.EACCES, errno.EPERM, errno.EROFS), (errno.ENOTDIR, errno.EEXIST)
 _REMEDIES = {
-    errno.ENOSPC: "free some space, or choose another disk",
-    errno.EDQUOT: "free some space, or choose another disk",
-    errno.EACCES: "choose a folder that you may write to",
-    errno.EPERM: "choose a folder that you may write to",
-    errno.EROFS: "choose a folder that you may write to",
-    errno.ENOTDIR: "choose another folder: a part of this path is a file",
-    errno.EEXIST: "choose another folder: a part of this path is a file",
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space, or choose another disk"),
+    **dict.fromkeys(_DENIED, "choose a folder that you may write to"),
+    **dict.fromkeys(_BLOCKED, "choose another folder: a part of this path is a file"),
     errno.EISDIR: "remove or rename the folder of this name",
     errno.ENAMETOOLONG: "choose a shorter name",
 }

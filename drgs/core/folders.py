@@ -87,7 +87,10 @@ class FolderRecord:
         names: of files that :meth:`claim` has named; None: all that are in the record.
         """
         known = self._content.files if names is None else dict.fromkeys(names)
-        files = {name: known[name] or self._compute_digest(name) for name in known}
+        files = {}
+        for name, recorded in known.items():
+            path = self.folder / name
+            files[name] = recorded or (digest(path) if path.is_file() else "")
         if self.exists and files != self._content.files:
             self._update(files, {})
 
@@ -107,11 +110,6 @@ class FolderRecord:
             return True
         known = self._content.files[name]
         return known is not None and known != digest(path)
-
-    def _compute_digest(self, name: str) -> str:
-        """Return a file's digest; empty if there is none."""
-        path = self.folder / name
-        return digest(path) if path.is_file() else ""
 
     def _update(self, files: Mapping[str, str | None], paths: Mapping[str, str]) -> None:
         """Add to the record as it is now, and remove the files that have an empty digest."""

@@ -95,26 +95,18 @@ def cameras_json(views: Iterable[View], origin: Origin) -> dict[str, object]:
     origin: of the views' positions, world; recorded if not zero.
     """
     recorded = {"origin": list(origin)} if origin != WORLD else {}
-    frames = [
-        {
+    frames = []
+    for view in (view.with_offset(np.array(origin)) for view in views):
+        frame: dict[str, object] = {
             "file_path": view.name,
             "transform_matrix": between_opencv_and_opengl(view.camera_to_world).tolist(),
             **{"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy},
             **{"w": view.width, "h": view.height},
-            **_lens_and_motion(view),
         }
-        for view in (view.with_offset(np.array(origin)) for view in views)
-    ]
+        if (lens := view.lens) is not None:
+            frame |= {"camera_model": MODELS.get(lens.kind, lens.kind), **lens.coefficients()}
+        if view.motion is not None:
+            frame[CLOSE_POSE_KEY] = between_opencv_and_opengl(view.motion.close_to_world).tolist()
+            frame["shutter"] = view.motion.shutter
+        frames.append(frame)
     return {**recorded, "frames": frames}
-
-
-def _lens_and_motion(view: View) -> dict[str, object]:
-    """Return the values of a camera in ``transforms.json`` besides pose and intrinsics."""
-    values: dict[str, object] = {}
-    if view.lens is not None:
-        model = MODELS.get(view.lens.kind, view.lens.kind)
-        values |= {"camera_model": model, **view.lens.coefficients()}
-    if view.motion is not None:
-        values[CLOSE_POSE_KEY] = between_opencv_and_opengl(view.motion.close_to_world).tolist()
-        values["shutter"] = view.motion.shutter
-    return values

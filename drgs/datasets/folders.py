@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
@@ -91,7 +91,12 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
     files = [file for file in files if not any(ends_in(file, name) for name in out)] or files
     sizes = [read_photograph(image_size, file) for file in files]
     width, height = max(sizes, key=lambda size: (math.prod(size), size[1]))
-    data = {"path": folder, "type": layout, "image_size": _max_width(width, height, sizes)}
+    largest = max(each for each, _ in sizes)
+    if width * height > MAX_PIXELS:
+        widths = (width // factor for factor in range(2, width + 1))
+        shapes = (downscaled_size(width, height, each) for each in widths)
+        largest = next((each[0] for each in shapes if math.prod(each) <= MAX_PIXELS), 1)
+    data = {"path": folder, "type": layout, "image_size": largest}
     values = {"data": data, "iterations": ITERATIONS.get(layout, 4500)}
     config = config_from(values, where, overrides)
     size = "as they are"
@@ -103,15 +108,6 @@ def config_for(folder: Path, overrides: Iterable[str] = ()) -> tuple[FitConfig, 
         f"{NAMES.get(layout, f'photographs with the cameras of {layout}')}, {size}; "
         f"{config.iterations:,} iterations (--set changes any value, --budget 10m sets the time)"
     )
-
-
-def _max_width(width: int, height: int, sizes: Sequence[tuple[int, int]]) -> int:
-    """Return px, for images of ``sizes``, of which ``width`` x ``height`` is the largest."""
-    if width * height <= MAX_PIXELS:
-        return max(each for each, _ in sizes)
-    widths = (width // factor for factor in range(2, width + 1))
-    small = (w for w in widths if math.prod(downscaled_size(width, height, w)) <= MAX_PIXELS)
-    return next(small, 1)
 
 
 def explain(folder: Path) -> str:

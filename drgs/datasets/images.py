@@ -395,9 +395,8 @@ def compact_mask(mask: np.ndarray, store: MemoryStore = MEMORY) -> LazyImage:
 def _convert_lazily(
     kept: Pixels, convert: Callable[[np.ndarray], np.ndarray], store: MemoryStore
 ) -> LazyImage:
-    return LazyImage(
-        kept.shape, lambda: convert(np.asarray(kept)), kept.nbytes, None, store.is_on_disk
-    )
+    on_disk = store.is_on_disk
+    return LazyImage(kept.shape, lambda: convert(np.asarray(kept)), kept.nbytes, None, on_disk)
 
 
 def choose_store(

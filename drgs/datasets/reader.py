@@ -412,8 +412,12 @@ class Notices:
     def _duplicate_notes(self, train: Sequence[View], test: Sequence[View]) -> list[str]:
         """Return a note on duplicate photographs, or none."""
         groups = [[*train, *test]]
-        for key in (os.path.getsize, digest):
-            groups = [part for group in groups for part in _group_duplicates(group, cache(key))]
+        for key in map(cache, (os.path.getsize, digest)):
+            parts: dict[object, list[View]] = {}
+            for index, group in enumerate(groups):
+                for view in group:
+                    parts.setdefault((index, key(view.files["image"])), []).append(view)
+            groups = [part for part in parts.values() if len(part) > 1]
         if not groups:
             return []
         pairs = [" = ".join(self._name(v.files["image"]) for v in group) for group in groups]
@@ -425,13 +429,4 @@ class Notices:
 
 
 def _format_files(names: Sequence[str]) -> str:
-    ordered = sorted(names)
-    return f"{len(ordered):,} ({format_names(ordered)})"
-
-
-def _group_duplicates(views: Sequence[View], key: Callable[[Path], object]) -> list[list[View]]:
-    """Return groups of several views whose photographs have the same key."""
-    groups: dict[object, list[View]] = {}
-    for view in views:
-        groups.setdefault(key(view.files["image"]), []).append(view)
-    return [group for group in groups.values() if len(group) > 1]
+    return f"{len(names):,} ({format_names(sorted(names))})"

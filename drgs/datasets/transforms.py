@@ -228,9 +228,8 @@ class TransformsFrame:
             values |= {"cx": principal[0], "cy": principal[1]}
         values |= {"transform_matrix": opengl.tolist()}
         checked = validate(FrameValues, values, f"{source}: frame {index}: ")
-        return TransformsFrame(
-            checked, source, f"frames[{index}].", files={"image": image, **files}
-        )
+        found = {"image": image, **files}
+        return TransformsFrame(checked, source, f"frames[{index}].", files=found)
 
     @property
     def file_path(self) -> str:
@@ -275,22 +274,18 @@ def transforms_of(content: object, path: Path) -> TransformsFile:
         frames.append(TransformsFrame(values, path, f"frames[{index}].", inherited.keys()))
     names = {split: getattr(meta, f"{split}_filenames") for split in ("train", "val", "test")}
     lists = {split: listing for split, listing in names.items() if listing}
-    return TransformsFile(path, frames, meta.ply_file_path, lists, _unread_keys(meta))
+    models = {values.camera_model for values in (meta, *meta.frames)}
+    known = IGNORED_KEYS.union(*map(_coefficient_names, models))
+    in_frames = set().union(*(frame.model_extra or {} for frame in meta.frames)) - known
+    unread = sorted((meta.model_extra or {}).keys() - known)
+    unread += [f"frames[].{key}" for key in sorted(in_frames)]
+    unread = [one_line(key, 60) for key in unread]
+    return TransformsFile(path, frames, meta.ply_file_path, lists, unread)
 
 
 def note_unread(path: Path, keys: Sequence[str]) -> str:
     """Describe keys that are not read, for the user."""
     return f"{path}: keys that are not read: {format_names(keys, 8)}"
-
-
-def _unread_keys(meta: Transforms) -> list[str]:
-    """Return sorted keys; those of frames as ``frames[].key``."""
-    models = {values.camera_model for values in (meta, *meta.frames)}
-    known = IGNORED_KEYS.union(*map(_coefficient_names, models))
-    top = (meta.model_extra or {}).keys() - known
-    in_frames = set().union(*(frame.model_extra or {} for frame in meta.frames)) - known
-    keys = [*sorted(top), *(f"frames[].{key}" for key in sorted(in_frames))]
-    return [one_line(key, 60) for key in keys]
 
 
 def _coefficient_names(model: str | None) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from typing_extensions import override
 from drgs.config.extensions import EFFECTS
 from drgs.core.errors import UserError
 from drgs.core.types import TensorXf
-from drgs.effects.base import SimulatedEffect, TrainingEffect, as_tensor
+from drgs.effects.base import SimulatedEffect, TrainingEffect, as_channels
 
 if TYPE_CHECKING:
     from drgs.config.schema import FitConfig
@@ -68,7 +68,7 @@ class RandomBackground(TrainingEffect):
         transparent = 1 - np.asarray(view.alpha)
         if view.mask is not None:
             transparent = transparent * np.asarray(view.mask)
-        return as_tensor(np.repeat(transparent[:, :, None], 3, axis=2))
+        return as_channels(transparent)
 
     @override
     def before_render(self, fit: FitState, view: TrainingView) -> None:

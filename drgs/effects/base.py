@@ -23,7 +23,7 @@ from drgs.core.types import Float, TensorXf
 
 if TYPE_CHECKING:
     from drgs.config.schema import FitConfig
-    from drgs.datasets.types import Dataset, View
+    from drgs.datasets.types import Dataset, Pixels, View
     from drgs.gaussians.parameters import Gaussians
     from drgs.results.alignment import Alignment
     from drgs.training.views import FitState, TrainingView
@@ -290,8 +290,6 @@ def as_tensor(values: np.ndarray) -> TensorXf:
     return cast(TensorXf, mi.TensorXf(from_host(mi.Float, values), values.shape))
 
 
-def opacity_of(view: View) -> TensorXf | None:
-    """Upload a photograph's opacity, (H, W, 3); None where it is opaque everywhere."""
-    if view.alpha is None:
-        return None
-    return as_tensor(np.repeat(np.asarray(view.alpha)[:, :, None], 3, axis=2))
+def as_channels(plane: Pixels) -> TensorXf:
+    """Upload a plane (H, W) for each of three channels, (H, W, 3)."""
+    return as_tensor(np.repeat(np.asarray(plane)[:, :, None], 3, axis=2))

@@ -26,8 +26,8 @@ from drgs.effects.base import (
     Finding,
     ShortFit,
     SimulatedEffect,
+    as_channels,
     as_numbers,
-    opacity_of,
     trimmed_deviation,
 )
 from drgs.effects.optimised import CenteredEffect
@@ -113,7 +113,7 @@ class ColorCorrection(CenteredEffect):
     @override
     def upload(self, view: View) -> TensorXf | None:
         """Return the photograph's opacity, (H, W, 3); None where it is opaque everywhere."""
-        return opacity_of(view)
+        return None if view.alpha is None else as_channels(view.alpha)
 
     @override
     def before_render(self, fit: FitState, view: TrainingView) -> None:

@@ -10,7 +10,7 @@ from typing_extensions import override
 
 from drgs.config.extensions import EFFECTS
 from drgs.core.types import TensorXf
-from drgs.effects.base import SimulatedEffect, TrainingEffect, as_tensor
+from drgs.effects.base import SimulatedEffect, TrainingEffect, as_channels
 
 if TYPE_CHECKING:
     from drgs.config.schema import FitConfig
@@ -38,9 +38,7 @@ class Masks(TrainingEffect):
     @override
     def upload(self, view: View) -> TensorXf | None:
         """Return the mask, (H, W, 3); None where a view has none."""
-        if view.mask is None:
-            return None
-        return as_tensor(np.repeat(np.asarray(view.mask)[:, :, None], 3, axis=2))
+        return None if view.mask is None else as_channels(view.mask)
 
     @override
     def target_image(self, view: View, image: np.ndarray) -> np.ndarray:

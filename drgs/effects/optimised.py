@@ -54,10 +54,7 @@ class OptimisedEffect(TrainingEffect):
 
     def parameters(self, view: TrainingView) -> dict[str, Float]:
         """Return the numbers (K,) of a view, with derivatives enabled."""
-        return {
-            name: cast(Float, optimizer[name])
-            for name, optimizer in self._optimizers_of(view).items()
-        }
+        return {name: cast(Float, adam[name]) for name, adam in self._optimizers_of(view).items()}
 
     def step(self, view: TrainingView, decay: float) -> None:
         """Move the view's numbers along their derivatives; decay: factor of the rates."""

@@ -27,7 +27,7 @@ from drgs.config.extensions import EFFECTS
 from drgs.core.errors import UserError
 from drgs.core.files import write_json
 from drgs.core.types import Float, TensorXf
-from drgs.effects.base import Finding, ShortFit, SimulatedEffect, as_tensor, entries, opacity_of
+from drgs.effects.base import Finding, ShortFit, SimulatedEffect, as_channels, entries
 from drgs.effects.colors import ColorConfig
 from drgs.effects.optimised import CenteredEffect
 from drgs.effects.tones import find_tones
@@ -109,7 +109,7 @@ class Photometry(CenteredEffect):
         y, x = np.mgrid[: view.height, : view.width] + 0.5
         squares = np.square(x - view.cx) + np.square(y - view.cy)
         squares *= 4 / (view.width**2 + view.height**2)
-        return as_tensor(np.repeat(squares[:, :, None], 3, axis=2)), opacity_of(view)
+        return as_channels(squares), None if view.alpha is None else as_channels(view.alpha)
 
     @override
     def before_render(self, fit: FitState, view: TrainingView) -> None:

@@ -27,12 +27,8 @@ def add_arguments(parser: CommandParser) -> None:
         "Writes nothing. `drgs fit FOLDER` begins with the same."
     )
     parser.show_examples("%(prog)s photographs")
-    parser.add_argument(
-        "config",
-        type=file_or_folder,
-        metavar="FOLDER|CONFIG.yml",
-        help="dataset folder, or configuration file, whose own values are not examined",
-    )
+    text = "dataset folder, or configuration file, whose own values are not examined"
+    parser.add_argument("config", type=file_or_folder, metavar="FOLDER|CONFIG.yml", help=text)
     parser.add_overrides("value of the configuration, which is then not examined")
     add_execution_arguments(parser)
     parser.set_defaults(run=run)

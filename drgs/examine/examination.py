@@ -162,7 +162,10 @@ def examine(
     except short_fits.OutOfTimeError:
         note = f"short fits take longer than the {seconds:.0f} s that --budget leaves for them"
         return Examination((), 0, time.perf_counter() - started, note)
-    if (alike := _resemblance(base)) < MIN_RESEMBLANCE:
+    # The share of training photographs' variance that aligned renderings do not explain.
+    pairs = zip(base.dataset.train, base.trained, strict=True)
+    left = [10 ** (-one.psnr / 10) / np.var(np.asarray(view.image)) for view, one in pairs]
+    if (alike := 1 - np.median(left)) < MIN_RESEMBLANCE:
         note = f"short fits have {alike:.0%} of the photographs' variance, too little to compare"
         return Examination((), 0, time.perf_counter() - started, note)
     decisions = []
@@ -176,13 +179,6 @@ def examine(
         decisions.append(_reject(look_for_moving_things(base)))
     num_held_out = sum(len(fold.test) for fold in folds[: base.num_folds])
     return Examination(tuple(decisions), num_held_out, time.perf_counter() - started)
-
-
-def _resemblance(fit: ShortFit) -> float:
-    """Return the middle share of training photographs' variance that aligned renderings explain."""
-    pairs = zip(fit.dataset.train, fit.trained, strict=True)
-    left = [10 ** (-one.psnr / 10) / np.var(np.asarray(view.image)) for view, one in pairs]
-    return float(1 - np.median(left))
 
 
 def _try(
@@ -308,7 +304,11 @@ def _look_for_background(fit: ShortFit) -> Finding | None:
     views = (*fit.dataset.train, *fit.dataset.test)
     if any(view.alpha is not None or view.mask is not None for view in views):
         return None
-    borders = [_border(np.asarray(view.image)) for view in views]
+    borders = []
+    for view in views:
+        inner = np.zeros((view.height, view.width), bool)
+        inner[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
+        borders.append(np.asarray(view.image)[~inner])  # (N, 3)
     colors = np.array([np.median(border, axis=0) for border in borders])
     deviations = [border - color for border, color in zip(borders, colors, strict=True)]
     share = float((np.abs(np.concatenate(deviations)) < BORDER_TOLERANCE).all(axis=1).mean())
@@ -320,10 +320,3 @@ def _look_for_background(fit: ShortFit) -> Finding | None:
     evidence = f"{share:.0%} of each border has one colour, mostly {shown}"
     changes = {"data.background": tuple(round(float(value), 3) for value in color)}
     return Finding("background of one colour", evidence, is_likely, changes)
-
-
-def _border(image: np.ndarray) -> np.ndarray:
-    """Return the outermost pixels (N, 3) of an image."""
-    inner = np.zeros(image.shape[:2], bool)
-    inner[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
-    return image[~inner]

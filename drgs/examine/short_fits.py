@@ -18,7 +18,7 @@ from drgs.datasets.images import smaller_view, with_arrays
 from drgs.datasets.types import Dataset, evenly_spaced
 from drgs.effects.base import ShortFit
 from drgs.initialization.defaults import resolve_defaults
-from drgs.initialization.start import Start, gaussians_at, start_of
+from drgs.initialization.start import gaussians_at, start_of
 from drgs.results.alignment import align
 from drgs.training.trainer import Trainer
 
@@ -127,14 +127,11 @@ def add_fold(
 
 def _make_trainer(config: FitConfig, split: Dataset) -> Trainer:
     config = resolve_defaults(config, split)
-    return Trainer(config, split, gaussians_at(_fewer(start_of(config, split)), config))
-
-
-def _fewer(start: Start) -> Start:
-    """Return at most as many points as a short fit has Gaussians."""
-    every = -(-len(start.means) // NUM_GAUSSIANS)
+    start = start_of(config, split)
+    every = -(-len(start.means) // NUM_GAUSSIANS)  # at most as many points as Gaussians
     colors = None if start.colors is None else start.colors[::every]
-    return replace(start, means=start.means[::every], colors=colors, gaussians=None)
+    start = replace(start, means=start.means[::every], colors=colors, gaussians=None)
+    return Trainer(config, split, gaussians_at(start, config))
 
 
 def shorten(config: FitConfig) -> FitConfig:

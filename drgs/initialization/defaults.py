@@ -68,8 +68,16 @@ def resolve_defaults(config: FitConfig, dataset: Dataset) -> FitConfig:
     if config.coarse is None or config.optimizer.scales_lr is None:
         is_cut_out = _is_cut_out(dataset)  # reads images, which a parallel fit has on other ranks
         if config.coarse is None:
-            starts_fine = is_cut_out or config.init.gaussians is not None
-            changes["coarse"] = [] if starts_fine else _coarse_stages(config, dataset)
+            until = round(COARSE_SHARE * config.iterations)
+            sides = [min(view.width, view.height) for view in dataset.train]
+            is_coarse = (
+                not is_cut_out  # cut-out objects start in place
+                and config.init.gaussians is None
+                and STRATEGIES.get(config.densify.strategy).value.begins_coarse
+                and until >= 1
+                and min(sides, default=0) >= MIN_COARSE_SIDE_PX
+            )
+            changes["coarse"] = [{"until": until, "factor": 2}] if is_coarse else []
         if config.optimizer.scales_lr is None:
             changes["optimizer.scales_lr"] = SCALES_LR_CUT_OUT if is_cut_out else SCALES_LR
     return with_changes(config, changes) if changes else config
@@ -89,17 +97,6 @@ def _numbers_of_gaussians(config: FitConfig, dataset: Dataset) -> dict[str, obje
     if config.init.num_points is None:
         changes["init.num_points"] = min(at_start, densify.max_gaussians)
     return changes
-
-
-def _coarse_stages(config: FitConfig, dataset: Dataset) -> list[dict[str, int]]:
-    """Return coarse stages for photographs that are not cut out: cut-out objects start in place."""
-    until = round(COARSE_SHARE * config.iterations)
-    sides = [min(view.width, view.height) for view in dataset.train]
-    is_small = min(sides, default=0) < MIN_COARSE_SIDE_PX
-    begins_coarse = STRATEGIES.get(config.densify.strategy).value.begins_coarse
-    if not begins_coarse or until < 1 or is_small:
-        return []
-    return [{"until": until, "factor": 2}]
 
 
 def _is_cut_out(dataset: Dataset) -> bool:

@@ -131,9 +131,8 @@ def swept_points(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     swept = [i for i in evenly_spaced(range(len(views)), MAX_PHOTOGRAPHS) if neighbours[i]]
     for index in {*swept, *(other for i in swept for other in neighbours[i])}:
         photographs[index] = _Photograph.shrink(views[index])
-    maps = {
-        i: _sweep(photographs[i], [photographs[j] for j in neighbours[i]], inverse) for i in swept
-    }
+    beside = {i: [photographs[j] for j in neighbours[i]] for i in swept}
+    maps = {i: _sweep(photographs[i], beside[i], inverse) for i in swept}
     points, colors = [], []
     step = inverse[0] - inverse[1]
     for index in swept:
@@ -191,9 +190,8 @@ def _sweep(
     inner = best.clip(1, planes - 2)
     before, at, after = (np.take_along_axis(cost, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
     curvature = before - 2 * at + after
-    shift = np.where(
-        curvature > 0, (before - after) / (2 * np.where(curvature > 0, curvature, 1)), 0
-    )
+    is_bent = curvature > 0
+    shift = np.where(is_bent, (before - after) / (2 * np.where(is_bent, curvature, 1)), 0)
     is_clear = (at < GOOD_COST) & (at < MAX_RATIO * np.median(cost, axis=0)) & (best == inner)
     if photograph.view.mask is not None:
         f, mask = photograph.factor, np.asarray(photograph.view.mask)

@@ -97,7 +97,9 @@ def gaussians_at(start: Start, config: FitConfig) -> Gaussians:
     means = np.ascontiguousarray(start.means, np.float32)
     colors = np.full(means.shape, 0.5) if start.colors is None else start.colors
     spacing = np.sqrt(mean_squared_neighbour_distance(means))
-    spacing = np.maximum(spacing, MIN_SPACING * _median_radius(means))
+    from_middle = means.astype(np.float64) - np.median(means.astype(np.float64), axis=0)
+    radii = np.linalg.norm(from_middle, axis=1)
+    spacing = np.maximum(spacing, MIN_SPACING * float(np.median(radii) or radii.max()))
     opacities = np.full(len(means), config.init.opacity)
     if (sky := start.sky) is not None:
         means = np.concatenate([means, sky.means], dtype=np.float32)
@@ -310,13 +312,6 @@ def _with_colors(start: Start, dataset: Dataset) -> Start:
     if colors is None:
         return start
     return replace(start, colors=colors, description=f"{start.description}, coloured")
-
-
-def _median_radius(points: np.ndarray) -> float:
-    """Return the median distance of points (N, 3) from their middle; the largest if that is 0."""
-    points = points.astype(np.float64)
-    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    return float(np.median(distances) or distances.max())
 
 
 def mean_squared_neighbour_distance(points: np.ndarray) -> np.ndarray:

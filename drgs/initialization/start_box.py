@@ -104,7 +104,11 @@ def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Genera
     focus, distance = focus_of(views)
     kept = np.empty((0, 3))
     for _ in range(MAX_BATCHES):
-        points = focus + distance * _near_and_far(count, rng)
+        points = rng.uniform(-1, 1, (count, 3))
+        is_far = rng.random(count) < FAR_SHARE
+        size = np.abs(points[is_far]).max(axis=1, keepdims=True)  # 1: on the cube's surface
+        points[is_far] /= size * rng.uniform(1 / FARTHEST, 1, size.shape)
+        points = focus + distance * points
         visible, clear = np.zeros(count, bool), np.ones(count, bool)
         for view in views:
             offsets = points - view.center
@@ -117,15 +121,6 @@ def points_in_view(views: Sequence[Viewpoint], count: int, rng: np.random.Genera
         "init.half_extent: no start box can be derived from the cameras, which see too little of "
         f"what is around {np.round(focus, 3).tolist()}; set it, or give init.point_cloud"
     )
-
-
-def _near_and_far(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return random points (count, 3) in and around the cube [-1, 1]^3."""
-    points = rng.uniform(-1, 1, (count, 3))
-    is_far = rng.random(count) < FAR_SHARE
-    size = np.abs(points[is_far]).max(axis=1, keepdims=True)  # 1: on the cube's surface
-    points[is_far] /= size * rng.uniform(1 / FARTHEST, 1, size.shape)
-    return points
 
 
 def _in_image(points: np.ndarray, view: Viewpoint, part: float = 1.0) -> np.ndarray:

@@ -87,18 +87,13 @@ def _silhouette(view: View) -> Silhouette:
         opaque |= left_out
         solid |= left_out
     scale = -(-max(opaque.shape) // MAX_SIDE_PX)
-    opaque, solid = (_merge_pixels(pixels, scale) for pixels in (opaque, solid))
+    for axis in (0, 1):  # squares of pixels, any of which is set; the last may be smaller
+        starts = np.arange(0, opaque.shape[axis], scale)
+        opaque, solid = (np.logical_or.reduceat(each, starts, axis) for each in (opaque, solid))
     table = np.zeros((opaque.shape[0] + 1, opaque.shape[1] + 1), np.int32)
     np.cumsum(opaque, axis=0, dtype=np.int32, out=table[1:, 1:])
     np.cumsum(table[1:, 1:], axis=1, out=table[1:, 1:])
     return Silhouette(view, scale, solid, table, transparent)
-
-
-def _merge_pixels(pixels: np.ndarray, scale: int) -> np.ndarray:
-    """Return whether any pixel is set in squares of ``scale``; the last ones may be smaller."""
-    for axis in (0, 1):
-        pixels = np.logical_or.reduceat(pixels, np.arange(0, pixels.shape[axis], scale), axis)
-    return pixels
 
 
 def num_transparent(silhouettes: Sequence[Silhouette]) -> int:
@@ -194,18 +189,13 @@ def _points_in(silhouettes: Sequence[Silhouette], cubes: Cubes, seed: int) -> np
             distance, _ = KDTree(inside).query(cubes.centers())
         thin = cubes.select(distance > THIN * cubes.edge)
     surface = inside[_half_empty(silhouettes, inside, SHELL * cubes.edge / 2)]
-    return np.concatenate([surface, _thin_points(silhouettes, thin)])
-
-
-def _thin_points(silhouettes: Sequence[Silhouette], cubes: Cubes) -> np.ndarray:
-    """Return points (M, 3) of the hull in cubes without a point, at most one in each eighth."""
-    levels = 0
-    while levels == 0 or (levels < THIN_LEVELS and len(cubes) <= CUBES_PER_CHUNK):
-        cubes = cubes.divide()
-        cubes = cubes.select(_shown_by_all(silhouettes, cubes.centers(), cubes.edge))
+    levels = 0  # of divisions of cubes without a point, of whose eighths each gets one at most
+    while levels == 0 or (levels < THIN_LEVELS and len(thin) <= CUBES_PER_CHUNK):
+        thin = thin.divide()
+        thin = thin.select(_shown_by_all(silhouettes, thin.centers(), thin.edge))
         levels += 1
-    _, first = np.unique(cubes.index >> (levels - 1), axis=0, return_index=True)
-    return cubes.centers()[np.sort(first)]
+    _, first = np.unique(thin.index >> (levels - 1), axis=0, return_index=True)
+    return np.concatenate([surface, thin.centers()[np.sort(first)]])
 
 
 def _shown_by_all(

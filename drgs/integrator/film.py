@@ -284,13 +284,6 @@ def environment_radiance(emitter: mi.Emitter, camera: Camera, place: mi.Point2f)
     return mi.Color3f([dr.block_sum(color, count) for color in radiance]) / count
 
 
-def stretched_radiance(texture: mi.Texture, film: mi.Film, place: mi.Point2f) -> mi.Color3f:
-    """Return a texture that is stretched over the film; place: on the crop window, px."""
-    interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(place))
-    interaction.uv = (place + mi.Vector2f(film.crop_offset())) / mi.Vector2f(film.size())
-    return mi.Color3f(texture.eval(interaction))
-
-
 def background_radiance(
     film: mi.Film,
     background: mi.Emitter | mi.Texture,
@@ -300,5 +293,10 @@ def background_radiance(
     """Return backgrounds by time (cameras) and pass; offsets: from pixels' upper left, in px."""
     places = [pixel_corners(film, num_samples(film, x)) + mi.Vector2f(x, y) for x, y in offsets]
     if isinstance(background, mi.Texture):
-        return [[stretched_radiance(background, film, place) for place in places]] * len(cameras)
+        stretched = []  # the texture, over the film
+        for place in places:
+            interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(place))
+            interaction.uv = (place + mi.Vector2f(film.crop_offset())) / mi.Vector2f(film.size())
+            stretched.append(mi.Color3f(background.eval(interaction)))
+        return [stretched] * len(cameras)
     return [[environment_radiance(background, camera, p) for p in places] for camera in cameras]

@@ -76,9 +76,9 @@ class CombinedParts:
 
     def matches(self, parts: Sequence[Part]) -> bool:
         """Return whether ``parts`` would give the same Gaussians."""
-        return same_variables(
-            [part.values for part in self.parts], [part.values for part in parts]
-        ) and [part.fixed_inputs for part in self.parts] == [part.fixed_inputs for part in parts]
+        own, other = ([part.values for part in each] for each in (self.parts, parts))
+        inputs = [[part.fixed_inputs for part in each] for each in (self.parts, parts)]
+        return same_variables(own, other) and inputs[0] == inputs[1]
 
     def accumulate(self, parts: Sequence[Part], gradients: Gaussians) -> None:
         """Accumulate derivatives into the same parts, attached."""

@@ -93,9 +93,13 @@ def _sensor(view: Viewpoint, calibrated: bool) -> dict[str, object]:
         "near_clip": NEAR_CLIP,
         "sampler": {"type": "independent", "sample_count": 1},
     }
-    is_perspective = view.lens is None and view.motion is None and _has_square_pixels(view)
+    focal = math.sqrt(view.fx * view.fy)
+    shift = max(
+        abs(view.fx / focal - 1) * max(view.cx, view.width - view.cx),
+        abs(view.fy / focal - 1) * max(view.cy, view.height - view.cy),
+    )
+    is_perspective = view.lens is None and view.motion is None and shift <= SQUARE_PIXEL_TOLERANCE
     if is_perspective and not calibrated:
-        focal = math.sqrt(view.fx * view.fy)
         return pose | {
             "type": "perspective",
             "fov": math.degrees(2 * math.atan(0.5 * view.width / focal)),
@@ -116,16 +120,6 @@ def _sensor(view: Viewpoint, calibrated: bool) -> dict[str, object]:
 
 def _to_world(camera_to_world: np.ndarray) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f(camera_to_world @ OPENCV_TO_MITSUBA)
-
-
-def _has_square_pixels(view: Viewpoint) -> bool:
-    """Compare the focal lengths, to within :data:`SQUARE_PIXEL_TOLERANCE`."""
-    focal = math.sqrt(view.fx * view.fy)
-    shift = max(
-        abs(view.fx / focal - 1) * max(view.cx, view.width - view.cx),
-        abs(view.fy / focal - 1) * max(view.cy, view.height - view.cy),
-    )
-    return shift <= SQUARE_PIXEL_TOLERANCE
 
 
 def render_views(scene: mi.Scene, views: Iterable[Viewpoint]) -> Iterator[np.ndarray]:

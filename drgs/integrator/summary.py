@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 import mitsuba as mi
 
 from drgs.cameras.camera import Camera
-from drgs.cameras.lens import Lens, Pinhole
+from drgs.cameras.lens import Pinhole
 from drgs.cameras.viewpoints import Viewpoint
 from drgs.effects.base import SimulatedEffect, antialiasing_effect
 from drgs.effects.compose import without_effects
@@ -58,8 +58,13 @@ def summary_of_sensors(
         ignored = sum(words(camera) is not None for camera in cameras) > len(shown)
         return SimulatedEffect(name, " and ".join(sorted(set(shown))) or None, why, ignored)
 
+    def lens_words(camera: Camera) -> str | None:
+        names = ", ".join(camera.lens.coefficients())
+        described = type(camera.lens).__name__ + (f" ({names})" if names else "")
+        return None if isinstance(camera.lens, Pinhole) else described
+
     of_cameras = [
-        effect("lens", lambda camera: _lens_words(camera.lens)),
+        effect("lens", lens_words),
         effect("depth of field", lambda camera: None if camera.aperture is None else "a thin lens"),
         effect("motion", lambda camera: None if camera.shutter is None else camera.shutter.label),
     ]
@@ -110,13 +115,6 @@ def _summary_of_integrator(
     if values:
         effects.append(SimulatedEffect("approximations", ", ".join(values), FILE_HEADER_REASON))
     return effects
-
-
-def _lens_words(lens: Lens) -> str | None:
-    if isinstance(lens, Pinhole):
-        return None
-    names = ", ".join(lens.coefficients())
-    return type(lens).__name__ + (f" ({names})" if names else "")
 
 
 def view_dependence_effect(degree: int, why: str) -> SimulatedEffect:

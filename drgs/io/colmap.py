@@ -187,17 +187,12 @@ def _images(
         _check_numbers(place, ("TX", "TY", "TZ"), pose[4:])
         if camera not in cameras:
             raise UserError(f"{place}: the number of a camera was expected, got {camera}")
-        images[name] = ColmapImage(name, camera, _camera_to_world(*pose))
+        rotation = Rotation.from_quat(pose[:4], scalar_first=True).inv()
+        camera_to_world = np.eye(4)
+        camera_to_world[:3, :3] = rotation.as_matrix()
+        camera_to_world[:3, 3] = -rotation.apply(pose[4:])
+        images[name] = ColmapImage(name, camera, camera_to_world)
     return tuple(images.values())
-
-
-def _camera_to_world(w: float, x: float, y: float, z: float, *translation: float) -> np.ndarray:
-    """Return the pose (4, 4) from a quaternion and a translation, world to camera."""
-    rotation = Rotation.from_quat([x, y, z, w]).inv()
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.as_matrix()
-    pose[:3, 3] = -rotation.apply(translation)
-    return pose
 
 
 def _points(records: Iterable[tuple]) -> np.recarray:
@@ -302,8 +297,11 @@ def _text_records(path: Path, parse: Callable[[str], tuple], form: str) -> Itera
     text = read_text(path, "file", MAX_FILE_BYTES, TEXT_MEMORY_RATIO)
     follows_image = False
     for number, line in enumerate(text.split("\n"), 1):
-        # An image's second line may be empty, or, of some programs, missing.
-        if line.strip()[:1] in ("", "#") or (follows_image and _is_observations(line)):
+        # An image's second line may be empty, or, of some programs, missing. Otherwise it has
+        # X Y POINT3D_ID of some points; a photograph's line ends with its name.
+        words = line.split()
+        has_points = follows_image and len(words) % 3 == 0
+        if line.strip()[:1] in ("", "#") or (has_points and words[-1].lstrip("-").isdecimal()):
             follows_image = False
             continue
         follows_image, place = path.stem == "images", Place(path, "line", number)
@@ -312,12 +310,6 @@ def _text_records(path: Path, parse: Callable[[str], tuple], form: str) -> Itera
         except ValueError:
             raise UserError(f"{place}: {form} was expected, got {one_line(line, 60)}") from None
         yield place, *record
-
-
-def _is_observations(line: str) -> bool:
-    """Return whether a line may be X Y POINT3D_ID of some points, and not a photograph's name."""
-    words = line.split()
-    return len(words) % 3 == 0 and words[-1].lstrip("-").isdecimal()
 
 
 def _parse_camera(line: str) -> tuple:

@@ -111,7 +111,9 @@ class CompressedPly(FileFormat):
             "packed_scale": np.clip(log_scales, -MAX_LOG_SCALE, MAX_LOG_SCALE),
             "packed_color": colors_from_sh0(g["sh0"]),
         }
-        bounds = {name: _bounds(v) for name, v in values.items()}
+        starts = np.arange(0, len(order), CHUNK)  # of groups; their bounds are (C, 3) float32
+        ends = np.minimum.reduceat, np.maximum.reduceat
+        bounds = {k: [end(v, starts).astype("<f4") for end in ends] for k, v in values.items()}
         parts = {name: _parts(v, *bounds[name]) for name, v in values.items()}
         opacities = opacities_from_logits(g["logit_opacities"])
         parts["packed_color"] = np.column_stack([parts["packed_color"], opacities])
@@ -143,13 +145,6 @@ def _packed_harmonics(sh: np.ndarray) -> np.ndarray:
         level = np.floor((values / (2 * SH_RANGE) + 0.5) * SH_LEVELS)
         levels[:, column] = np.clip(level, 0, SH_LEVELS - 1)
     return _structured_array([f"f_rest_{i}" for i in range(3 * count)], levels)
-
-
-def _bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smallest and largest values (C, 3) of each group of values (N, 3); float32."""
-    starts = np.arange(0, len(values), CHUNK)
-    low, high = (limit.reduceat(values, starts, axis=0) for limit in (np.minimum, np.maximum))
-    return low.astype("<f4"), high.astype("<f4")
 
 
 def _parts(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

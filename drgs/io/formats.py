@@ -179,7 +179,14 @@ def encode(name: str, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) ->
     extension = FORMATS.get(name)
     check(name, gaussians)
     kept = {k: v for k, v in rendered_with.items() if extension.value.holds(k)}
-    _note_cut_off(name, gaussians, extension.value.ranges)
+    beyond = []
+    for field, (low, high) in extension.value.ranges.items():
+        values = gaussians[field].reshape(len(gaussians[field]), -1)
+        if number := np.count_nonzero(((values < low) | (values > high)).any(axis=1)):
+            beyond.append(f"{field} of {number:,} (it holds {low:.4g} to {high:.4g})")
+    if beyond:
+        num = len(gaussians["means"])
+        note_user(f"the format {name} cuts off, of {num:,} Gaussians: {'; '.join(beyond)}")
     with extension.reporting():
         content = extension.value().encode(gaussians, kept)
         if not isinstance(content, (bytes, bytearray, memoryview)):
@@ -209,18 +216,6 @@ def check_shapes(name: str, gaussians: Arrays) -> None:
         _check_shapes(gaussians, 0)
     except ValueError as error:
         raise UserError(f"the format {name}: {error}") from None
-
-
-def _note_cut_off(name: str, gaussians: Arrays, ranges: Mapping[str, tuple[float, float]]) -> None:
-    found = []
-    for field, (low, high) in ranges.items():
-        values = gaussians[field].reshape(len(gaussians[field]), -1)
-        beyond = ((values < low) | (values > high)).any(axis=1)
-        if number := np.count_nonzero(beyond):
-            found.append(f"{field} of {number:,} (it holds {low:.4g} to {high:.4g})")
-    if found:
-        num = len(gaussians["means"])
-        note_user(f"the format {name} cuts off, of {num:,} Gaussians: {'; '.join(found)}")
 
 
 def _check_shapes(arrays: Arrays, least: int = 1) -> None:

@@ -173,9 +173,8 @@ def _document(
         node["translation"] = list(origin)
     views, accessors, start = [], [], 0
     for name, values in attributes.items():
-        views.append(
-            {"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": ARRAY_BUFFER}
-        )
+        part = {"byteOffset": start, "byteLength": values.nbytes}
+        views.append({"buffer": 0, **part, "target": ARRAY_BUFFER})
         accessor = {
             "bufferView": len(accessors),
             "componentType": BYTE if values.dtype == "u1" else FLOAT,

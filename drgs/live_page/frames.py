@@ -50,9 +50,8 @@ class ViewerCamera:
     def viewpoint(self, width: int, height: int) -> Viewpoint:
         """Return the pinhole camera of this field of view, with an image of this size (px)."""
         half = math.tan(math.radians(self.fov) / 2) * width / height
-        return pinhole(
-            "eye", self.camera_to_world, width, height, 2 * math.degrees(math.atan(half))
-        )
+        fov = 2 * math.degrees(math.atan(half))
+        return pinhole("eye", self.camera_to_world, width, height, fov)
 
 
 @dataclass(frozen=True, eq=False)

@@ -130,9 +130,8 @@ class CameraControls:
         }
         self._lens.on_update(event_handler(self._show_lens_sliders))
         with gui.add_folder("Accuracy", expand_by_default=False):
-            self._values = {
-                name: self._observe(self._control(name)) for name in ADJUSTABLE_APPROXIMATIONS
-            }
+            names = ADJUSTABLE_APPROXIMATIONS
+            self._values = {name: self._observe(self._control(name)) for name in names}
             button = gui.add_button("As fitted")
         button.on_click(event_handler(self._reset))
         button.on_click(self._changed)
@@ -160,17 +159,11 @@ class CameraControls:
         size = max(1, camera.image_width), max(1, camera.image_height)
         scale = min(1.0, int(self._side.value) / max(size))
         width, height = (max(1, round(scale * side)) for side in size)
-        return FrameRequest(
-            camera=ViewerCamera(pose, fov, distance),
-            width=width,
-            height=height,
-            lens=lens,
-            lens_parameters={
-                n: float(self._lens_sliders[n].value) for n in VIEWER_LENSES[lens].parameters
-            },
-            content=self._content.value,
-            approximations=self._approximations(),
-        )
+        names = VIEWER_LENSES[lens].parameters
+        parameters = {name: float(self._lens_sliders[name].value) for name in names}
+        view, content = ViewerCamera(pose, fov, distance), self._content.value
+        how = self._approximations()
+        return FrameRequest(view, width, height, lens, parameters, content, how)
 
     def _approximations(self) -> Approximations:
         values = {name: getattr(self._fitted, name) for name in DECLARED}
@@ -267,9 +260,8 @@ class Page:
         handle = self.server.get_clients().get(client)
         if handle is None:
             return
-        handle.scene.set_background_image(
-            frame.pixels, format="jpeg", jpeg_quality=JPEG_QUALITY[is_whole]
-        )
+        quality = JPEG_QUALITY[is_whole]
+        handle.scene.set_background_image(frame.pixels, format="jpeg", jpeg_quality=quality)
         handle.flush()
         if is_whole:
             self._set_text(client, self._describe(client, request, frame))

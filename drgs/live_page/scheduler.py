@@ -74,12 +74,6 @@ class _ClientState:
     seconds: float = 0.0
     seconds_whole: float = 4 * MOVING_SECONDS  # of a frame at full resolution, at most
 
-    def divisor_in_motion(self, request: FrameRequest) -> int:
-        """Return the divisor with which a frame takes :data:`MOVING_SECONDS` at most."""
-        in_time = math.ceil(math.sqrt(self.seconds_whole / MOVING_SECONDS))
-        largest = min(MAX_DIVISOR, min(request.width, request.height) // MIN_SIDE_PX)
-        return max(1, min(in_time, largest))
-
 
 @dataclass
 class RenderScheduler:
@@ -107,8 +101,10 @@ class RenderScheduler:
         return True
 
     def _due_divisor(self, pending: PendingRequest, state: _ClientState, now: float) -> int | None:
-        if pending is not state.shown:
-            return state.divisor_in_motion(pending.request)
+        if pending is not state.shown:  # a frame is to take MOVING_SECONDS at most
+            in_time = math.ceil(math.sqrt(state.seconds_whole / MOVING_SECONDS))
+            side = min(pending.request.width, pending.request.height)
+            return max(1, min(in_time, MAX_DIVISOR, side // MIN_SIDE_PX))
         if state.divisor > 1:
             # In steps: the camera may move again after each.
             return state.divisor // 2 if now - pending.at >= STILL_SECONDS else None

@@ -41,8 +41,13 @@ class LocalServer(viser.ViserServer):
 @contextmanager
 def run_server(port: int | None, option: str) -> Iterator[LocalServer]:
     """Serve an empty page within the block; port: None: first free from 8080; option: its name."""
-    if port is not None:
-        _check_free(port, option)
+    if port is not None:  # viser would take the next one beside one in use
+        try:
+            socket.create_server((ADDRESS, port)).close()
+        except OSError as error:
+            raise UserError(
+                f"{option} {port}: cannot listen at {ADDRESS}: {error.strerror}; choose another"
+            ) from None
     # They log a traceback, or thousands of lines, for a browser that leaves while it is served.
     for name in ("asyncio", "websockets.server"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -62,16 +67,6 @@ def run_server(port: int | None, option: str) -> Iterator[LocalServer]:
 def url(server: LocalServer) -> str:
     """Return the page's URL."""
     return f"http://{server.get_host()}:{server.get_port()}"
-
-
-def _check_free(port: int, option: str) -> None:
-    """Raise :class:`UserError` for a port in use, beside which viser would take the next one."""
-    try:
-        socket.create_server((ADDRESS, port)).close()
-    except OSError as error:
-        raise UserError(
-            f"{option} {port}: cannot listen at {ADDRESS}: {error.strerror}; choose another"
-        ) from None
 
 
 @contextmanager

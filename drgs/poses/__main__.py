@@ -35,9 +35,8 @@ def add_arguments(parser: CommandParser) -> None:
     usual = SfmSettings()
     parser.description = "Find out where photographs were taken, by COLMAP's structure from motion."
     parser.show_examples("%(prog)s photographs", "%(prog)s photographs --camera-model RADIAL")
-    parser.add_argument(
-        "folder", type=file_or_folder, metavar="FOLDER", help="with photographs, or with images/"
-    )
+    folder = "with photographs, or with images/"
+    parser.add_argument("folder", type=file_or_folder, metavar="FOLDER", help=folder)
     parser.add_argument(
         "--camera-model",
         choices=LENS_OF_MODEL,
@@ -45,13 +44,10 @@ def add_arguments(parser: CommandParser) -> None:
         metavar="MODEL",
         help=f"COLMAP's name of the lens: {', '.join(LENS_OF_MODEL)} (default: %(default)s)",
     )
-    parser.add_argument(
-        "--share",
-        choices=("alike", "one", "each"),
-        default=usual.share,
-        help="photographs that share a camera: those of the same size and EXIF, all, or none "
-        "(default: %(default)s)",
-    )
+    share = "photographs that share a camera: those of the same size and EXIF, all, or none "
+    share += "(default: %(default)s)"
+    choices = "alike", "one", "each"
+    parser.add_argument("--share", choices=choices, default=usual.share, help=share)
     parser.add_argument(
         "--compare",
         choices=("auto", "all", "neighbours"),
@@ -59,15 +55,11 @@ def add_arguments(parser: CommandParser) -> None:
         help=f"pairs to compare: all; by name the next {NEIGHBOURS} and some further ones, as for "
         f"frames of a video; auto: all of up to {ALL_PAIRS} photographs (default: %(default)s)",
     )
-    parser.add_argument(
-        "--mapper",
-        choices=("incremental", "global"),
-        default=usual.mapper,
-        help="place one photograph after another, or all at once (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--overwrite", action="store_true", help="replace the model that an earlier run wrote"
-    )
+    mapper = "place one photograph after another, or all at once (default: %(default)s)"
+    choices = "incremental", "global"
+    parser.add_argument("--mapper", choices=choices, default=usual.mapper, help=mapper)
+    overwrite = "replace the model that an earlier run wrote"
+    parser.add_argument("--overwrite", action="store_true", help=overwrite)
     parser.set_defaults(run=run, prog=parser.prog)
 
 

@@ -135,7 +135,9 @@ def photographs_in(folder: Path) -> tuple[Path, list[str]]:
         kind = describe_file(folder) or f"cannot open the folder: {error.strerror or error}"
         raise UserError(f"{folder}: {kind}") from None
     images = without_masks([p for p in images if is_image(p.name) and p.is_file()])
-    images.sort(key=_numeric_order)
+    # "frame 10" follows "frame 9".
+    parts = {path: re.split(r"([0-9]+)", str(path)) for path in images}
+    images.sort(key=lambda p: [(int(t[:18]) if t.isdecimal() else 0, t) for t in parts[p]])
     files = [path for path in images if path.suffix.lower() in SUFFIXES]
     unread = [path for path in images if path.suffix.lower() not in SUFFIXES]
     others = format_names([path.relative_to(photographs) for path in unread])
@@ -155,12 +157,6 @@ def photographs_in(folder: Path) -> tuple[Path, list[str]]:
     return photographs, [file.relative_to(photographs).as_posix() for file in files]
 
 
-def _numeric_order(file: Path) -> list[tuple[int, str]]:
-    """Return a key by which ``frame 10`` follows ``frame 9``."""
-    parts = re.split(r"([0-9]+)", str(file))
-    return [(int(part[:18]), part) if part.isdecimal() else (0, part) for part in parts]
-
-
 def reconstruct(folder: Path, settings: SfmSettings, replace: bool, watch: Progress) -> SfmResult:
     """Write ``folder/sparse/0``, COLMAP's model of the photographs in ``folder``.
 
@@ -174,16 +170,20 @@ def reconstruct(folder: Path, settings: SfmSettings, replace: bool, watch: Progr
     with sole_writer(folder) as keep:
         _check_free(folder, model, replace)
         try:
-            if keep():  # remove files of runs that were killed
-                for path in (folder, model.parent, model):
-                    for left in path.glob(f"{TEMPORARY}*"):
-                        shutil.rmtree(left, ignore_errors=True)
+            for path in (folder, model.parent, model) if keep() else ():
+                for left in path.glob(f"{TEMPORARY}*"):  # of runs that were killed
+                    shutil.rmtree(left, ignore_errors=True)
             # On the disk to which the files are moved.
             parent = next(path for path in (model, *model.parents) if path.is_dir())
             with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=parent) as temporary:
                 task = _Reconstruction(Path(temporary), photographs, folder, names, settings)
                 result = run_in_child(_Reconstruction.run, task, watch=watch)
-                _install_model(Path(temporary, "model"), model)
+                record = FolderRecord(model, COMMAND)
+                record.claim(MODEL_FILES)
+                (model / MODEL_FILES[-1]).unlink(missing_ok=True)  # or two models could be mixed
+                for name in MODEL_FILES:
+                    Path(temporary, "model", name).replace(model / name)
+                record.seal()
         except ChildEndedError as error:
             raise UserError(
                 f"{photographs}: structure from motion was ended: {error}; {REMEDY}"
@@ -203,15 +203,6 @@ def _check_free(folder: Path, model: Path, replace: bool) -> None:
             "then used instead"
         )
     FolderRecord(model, COMMAND).check(MODEL_FILES)
-
-
-def _install_model(written: Path, model: Path) -> None:
-    record = FolderRecord(model, COMMAND)
-    record.claim(MODEL_FILES)
-    (model / MODEL_FILES[-1]).unlink(missing_ok=True)  # first: there is no mixture of two models
-    for name in MODEL_FILES:
-        (written / name).replace(model / name)
-    record.seal()
 
 
 @dataclass

@@ -350,9 +350,8 @@ def _whitened_rays(affine: reference.LocalAffine, camera: Camera, low_pass: floa
         whitening = from_camera / scales[:, :, None]
     else:
         widening = np.sqrt(low_pass) * z[:, None, None] * np.eye(3)[:, :2] / focal
-        whitening = _inverse_factors(
-            np.concatenate([affine.axes, widening], axis=2), smallest=MIN_RELATIVE_STD * z
-        )
+        rows = np.concatenate([affine.axes, widening], axis=2)
+        whitening = _inverse_factors(rows, smallest=MIN_RELATIVE_STD * z)
     mean_rays = affine.means / z[:, None]
     return np.concatenate([whitening[:, :, :2] / focal, whitening @ mean_rays[:, :, None]], axis=2)
 

@@ -69,15 +69,10 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s out/fox --orbit 60 --panorama --out DIR",
         "%(prog)s scene.xml -D model=model.ply --out DIR",
     )
-    parser.add_argument(
-        "what",
-        type=file_or_folder,
-        metavar="MODEL|SCENE.xml|OUT_DIR",
-        help="file of Gaussians, Mitsuba scene, or output folder of a fit",
-    )
-    parser.add_argument(
-        "--out", type=file_or_folder, required=True, metavar="DIR", help="output folder"
-    )
+    add, kind = parser.add_argument, file_or_folder
+    what = "file of Gaussians, Mitsuba scene, or output folder of a fit"
+    add("what", type=kind, metavar="MODEL|SCENE.xml|OUT_DIR", help=what)
+    add("--out", type=kind, required=True, metavar="DIR", help="output folder")
     _add_cameras(parser)
     _add_settings(parser)
     parser.add_argument_group("Mitsuba scenes").add_argument(
@@ -95,79 +90,40 @@ def add_arguments(parser: CommandParser) -> None:
 def _add_cameras(parser: CommandParser) -> None:
     group = parser.add_argument_group("cameras")
     one_of = group.add_mutually_exclusive_group().add_argument
-    one_of(
-        "--split", choices=("test", "train"), help="cameras of the photographs, with PSNR and SSIM"
-    )
-    one_of(
-        "--orbit",
-        type=bounded_int(1, MAX_FRAMES),
-        metavar="N",
-        help="N frames of an orbit, and an animation",
-    )
-    one_of(
-        "--camera",
-        type=file_or_folder,
-        metavar="FILE.json",
-        help="cameras of a file in the layout of transforms.json",
-    )
+    split = "cameras of the photographs, with PSNR and SSIM"
+    one_of("--split", choices=("test", "train"), help=split)
+    orbit = "N frames of an orbit, and an animation"
+    one_of("--orbit", type=bounded_int(1, MAX_FRAMES), metavar="N", help=orbit)
+    camera = "cameras of a file in the layout of transforms.json"
+    one_of("--camera", type=file_or_folder, metavar="FILE.json", help=camera)
     one_of("--origin", **VECTOR, help="position of one camera")
     add = group.add_argument
-    add(
-        "--target",
-        **VECTOR,
-        help="point that it looks at (default: 0 0 0, relative to the model's origin)",
-    )
+    target = "point that it looks at (default: 0 0 0, relative to the model's origin)"
+    add("--target", **VECTOR, help=target)
     add("--up", **VECTOR, help="up direction of --origin or --orbit (default: 0 0 1)")
-    add(
-        "--fov",
-        type=degrees,
-        metavar="DEGREES",
-        help="horizontal field of view (default: 40; for --orbit, that of the photographs)",
-    )
-    add(
-        "--size",
-        **SIZE,
-        help="px (default: 400 400; for --orbit, at most that, in the photographs' proportions; "
-        "800 400 for --panorama)",
-    )
-    add(
-        "--panorama",
-        action="store_const",
-        const=True,
-        help="images in all directions (equirectangular) from these positions",
-    )
+    fov = "horizontal field of view (default: 40; for --orbit, that of the photographs)"
+    add("--fov", type=degrees, metavar="DEGREES", help=fov)
+    size = "px (default: 400 400; for --orbit, at most that, in the photographs' proportions; "
+    size += "800 400 for --panorama)"
+    add("--size", **SIZE, help=size)
+    panorama = "images in all directions (equirectangular) from these positions"
+    add("--panorama", action="store_const", const=True, help=panorama)
 
 
 def _add_settings(parser: CommandParser) -> None:
     group = parser.add_argument_group("rendering")
     add_background(group)
     add_error(group)
-    group.add_argument(
-        "--error-image",
-        action="store_const",
-        const=True,
-        help="write the error at each pixel beside each image, as colours (NAME.error.png)",
-    )
-    group.add_argument(
-        "--ignore",
-        nargs="+",
-        choices=IGNORABLE,
-        metavar="EFFECT",
-        help=f"effects to leave out: {', '.join(IGNORABLE)}",
-    )
-    group.add_argument(
-        "--scene",
-        type=file_or_folder,
-        metavar="CONFIG.yml",
-        help="configuration with the photographs and settings of the fit",
-    )
-    group.add_argument("--data", metavar="DIR", help="dataset folder (data.path)")
-    group.add_argument(
-        "--set",
-        action="append",
-        metavar="KEY=VALUE",
-        help="override a value of the configuration, as in data.image_size=200; repeatable",
-    )
+    add = group.add_argument
+    error = "write the error at each pixel beside each image, as colours (NAME.error.png)"
+    add("--error-image", action="store_const", const=True, help=error)
+    ignore = f"effects to leave out: {', '.join(IGNORABLE)}"
+    add("--ignore", nargs="+", choices=IGNORABLE, metavar="EFFECT", help=ignore)
+    scene = "configuration with the photographs and settings of the fit"
+    add("--scene", type=file_or_folder, metavar="CONFIG.yml", help=scene)
+    add("--data", metavar="DIR", help="dataset folder (data.path)")
+    value = "override a value of the configuration, as in data.image_size=200; repeatable"
+    add("--set", action="append", metavar="KEY=VALUE", help=value)
 
 
 def run(args: argparse.Namespace) -> None:

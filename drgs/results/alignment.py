@@ -64,10 +64,9 @@ def align(
     counts = np.broadcast_to(counts, (height, width))
     behind, is_opaque = np.zeros(3, np.float32), True
     if view.alpha is not None:
-        is_opaque = np.asarray(view.alpha) > 0
-        behind = np.asarray(background, np.float32) * (
-            1 - np.asarray(view.alpha, np.float32)[..., None]
-        )
+        alpha = np.asarray(view.alpha, np.float32)
+        is_opaque = alpha > 0
+        behind = np.asarray(background, np.float32) * (1 - alpha[..., None])
     blur = SIGMA_PX, SIGMA_PX, 0
     blurred = ndimage.gaussian_filter(photograph, blur)
     image, moved, gains = np.asarray(rendering, np.float32), np.zeros(4), np.zeros(3)
@@ -117,9 +116,8 @@ def _mean_step(image: np.ndarray, counts: np.ndarray) -> float:
     """Return the mean absolute difference of neighbouring pixels (H, W, 3) that count."""
     steps = [np.diff(image, axis=axis) for axis in (0, 1)]
     both = [np.minimum(counts[1:], counts[:-1]), np.minimum(counts[:, 1:], counts[:, :-1])]
-    sums = [
-        (np.abs(step).mean(axis=2) * each).sum() for step, each in zip(steps, both, strict=True)
-    ]
+    pairs = zip(steps, both, strict=True)
+    sums = [(np.abs(step).mean(axis=2) * each).sum() for step, each in pairs]
     return float(sum(sums) / max(counts.sum(), 1) + MIN_DEVIATION)
 
 
@@ -143,10 +141,8 @@ def _move(image: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         ndimage.map_coordinates(plane, [down, across], order=3, mode="nearest")
         for plane in np.moveaxis(image, 2, 0)
     ]
-    is_there = (np.abs(down - (height - 1) / 2) < height / 2) & (
-        np.abs(across - (width - 1) / 2) < width / 2
-    )
-    return np.stack(planes, axis=2), is_there
+    is_there = np.abs(down - (height - 1) / 2) < height / 2
+    return np.stack(planes, axis=2), is_there & (np.abs(across - (width - 1) / 2) < width / 2)
 
 
 def _directions(image: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import os
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 import yaml
@@ -226,9 +227,8 @@ def remove_run(folder: Path, images: Sequence[str] = ()) -> None:
     record, files = FolderRecord(folder, COMMAND), list(_files(folder))
     if names:
         load_run_config(folder)
-        _check_removable(
-            folder, record, sorted(set(names) - {CONFIG, *result_names()}), files, images
-        )
+        foreign = sorted(set(names) - {CONFIG, *result_names()})
+        _check_removable(folder, record, foreign, files, images)
     elif not os.path.lexists(folder):
         return
     remove_stale_temporaries(folder)
@@ -252,9 +252,8 @@ def _check_removable(
     else:
         known = set(_file_names(images))
         paths = {name: folder / name for name in files}
-        foreign += [
-            n for n, p in paths.items() if n not in known or p.is_symlink() or not p.is_file()
-        ]
+        regular = {name for name, path in paths.items() if path.is_file() and not path.is_symlink()}
+        foreign += [name for name in files if name not in known & regular]
     if not _is_unmodified(folder / CONFIG):
         foreign.append(CONFIG)
     if foreign:
@@ -342,11 +341,7 @@ def _values(config: FitConfig) -> dict[str, object]:
 
 def _differences(theirs: object, ours: object, key: str = "") -> list[str]:
     if isinstance(theirs, dict) and isinstance(ours, dict):
-        return [
-            difference
-            for name in {**ours, **theirs}
-            for difference in _differences(
-                theirs.get(name), ours.get(name), f"{key}.{name}".strip(".")
-            )
-        ]
+        pairs = {name: (theirs.get(name), ours.get(name)) for name in {**ours, **theirs}}
+        found = (_differences(*pair, f"{key}.{n}".strip(".")) for n, pair in pairs.items())
+        return list(chain.from_iterable(found))
     return [] if theirs == ours else [one_line(f"{key} = {theirs} (here {ours})", limit=120)]

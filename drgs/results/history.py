@@ -36,9 +36,8 @@ DENSITY_COLUMNS = ("iteration", *(field.name for field in fields(DensityReport))
 
 def write_history(path: Path, history: Sequence[HistoryRow]) -> None:
     """Write ``history.csv``."""
-    rows = [
-        [f"{v:.6g}" if isinstance(v, float) else v for v in vars(row).values()] for row in history
-    ]
+    values = (vars(row).values() for row in history)
+    rows = [[f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in values]
     write_csv(path, HistoryRow.__dataclass_fields__, rows)
 
 

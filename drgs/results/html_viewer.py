@@ -126,9 +126,8 @@ def viewer_page(
     Raises ``drgs.core.errors.UserError`` for non-finite Gaussians.
     """
     move = initial_view.to_page
-    in_file = Similarity(
-        move.scale, PAGE_TO_FILE_AXES @ move.rotation, PAGE_TO_FILE_AXES @ move.translation
-    )
+    axes = PAGE_TO_FILE_AXES
+    in_file = Similarity(move.scale, axes @ move.rotation, axes @ move.translation)
     gaussians = replace(shown.gaussians.numpy(), origin=WORLD)  # the page has no world
     splats = in_file.of_gaussians(gaussians).to_bytes("compressed-ply")
     files = resources.files("drgs.results")
@@ -172,10 +171,9 @@ def write_viewer(out: Path, dataset: Dataset, shown: DisplaySettings) -> None:
         return
     views = refined_viewpoints(out, dataset.origin) or dataset.train
     initial_view = InitialView.from_views(views, gaussians)
+    page = viewer_page(out.resolve().name, shown, initial_view, dataset.background)
     with atomic_path(out / VIEWER) as temporary:
-        temporary.write_bytes(
-            viewer_page(out.resolve().name, shown, initial_view, dataset.background)
-        )
+        temporary.write_bytes(page)
 
 
 def _file_bytes(num_gaussians: int, sh_degree: int) -> int:

@@ -246,9 +246,8 @@ def load_model(
     # Precedence: overrides, the file's header, the configuration.
     given = {override.partition("=")[0].strip() for override in overrides}
     header = (gaussians.rendered_with or {}).items()
-    values = from_ply_header(
-        str(path), {k: v for k, v in header if not given & {"model", f"model.{k}"}}
-    )
+    left = {k: v for k, v in header if not given & {"model", f"model.{k}"}}
+    values = from_ply_header(str(path), left)
     return Model(
         gaussians,
         settings.model_copy(update=values),
@@ -271,6 +270,5 @@ def load_open_config(
     config = config.model_copy(update={"model": config.model.with_3dgs_defaults()})
     if not is_open(config):
         return config
-    return resolve_defaults(
-        config, load_dataset(config.data_for_rendering, sections=config.sections)
-    )
+    dataset = load_dataset(config.data_for_rendering, sections=config.sections)
+    return resolve_defaults(config, dataset)

@@ -18,24 +18,16 @@ UP = (0.0, 0.0, 1.0)  # world: the convention of both dataset layouts
 
 def add_background(parser: argparse._ActionsContainer) -> None:
     """Add the argument for :func:`parse_background`."""
-    parser.add_argument(
-        "--background",
-        nargs="+",
-        metavar="COLOR",
-        help="white, black, R G B in 0..1, or an image file (default: that of the configuration, "
-        "or black without one)",
-    )
+    text = "white, black, R G B in 0..1, or an image file (default: that of the configuration, "
+    text += "or black without one)"
+    parser.add_argument("--background", nargs="+", metavar="COLOR", help=text)
 
 
 def add_error(parser: argparse._ActionsContainer) -> None:
     """Add the argument of an error budget."""
-    parser.add_argument(
-        "--error",
-        type=error_budget,
-        metavar="ERROR",
-        help="largest error of the approximations, which are then chosen by measurement: root mean "
-        'square in 0..1, "54dB" or "0.5steps" (of 8 bits)',
-    )
+    text = "largest error of the approximations, which are then chosen by measurement: root mean "
+    text += 'square in 0..1, "54dB" or "0.5steps" (of 8 bits)'
+    parser.add_argument("--error", type=error_budget, metavar="ERROR", help=text)
 
 
 def parse_background(words: Sequence[str] | None) -> Background | None:

@@ -157,13 +157,13 @@ def plan_step(
     is_settled = first >= config.densify.first_fixed_iteration(config.iterations)
     late_views = config.optimizer.views if is_late and is_settled else 1
     order = len(phase.shifted), config.seed, views_per_step
+    places = ((i, phase.view(view_of(i, *order), i)) for i in iterations if i > 0)
+    views = [StepView(i, i - first, view) for i, view in places]
     return Step(
         iterations=iterations,
         phase=phase,
         begins_phase=any(first - views_per_step <= each.until < first for each in phases),
-        views=tuple(
-            StepView(i, i - first, phase.view(view_of(i, *order), i)) for i in iterations if i > 0
-        ),
+        views=tuple(views),
         num_averaged=max(late_views, len(iterations)),
         is_update=late_views <= views_per_step or last % late_views == 0,
     )

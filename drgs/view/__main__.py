@@ -45,12 +45,9 @@ def add_arguments(parser: CommandParser) -> None:
     )
     add_background(parser)
     add_error(parser)
-    parser.add_argument(
-        "--up",
-        **VECTOR,
-        help="axis that the camera orbits about (default: mean up direction of the training "
-        "cameras; 0 0 1 for a file)",
-    )
+    text = "axis that the camera orbits about (default: mean up direction of the training "
+    text += "cameras; 0 0 1 for a file)"
+    parser.add_argument("--up", **VECTOR, help=text)
     parser.add_argument("--port", **PORT)
     add_execution_arguments(parser)
     parser.set_defaults(run=run)

@@ -173,9 +173,8 @@ def _bsdf_refusal(parameter: Parameter, kind: str) -> str | None:
         return f"{name} is around a perfect mirror or glass; use a rough one"
     if kind in REPLAYED_INTEGRATORS and _is_mirror(outer):
         return f"{kind} leaves out what perfect mirrors and glass reflect; {TO_SPLATPATH}"
-    if kind in ATTACHED_INTEGRATORS and any(
-        b.class_name() not in DIFFERENTIATED_BY_PATH for b in parameter.bsdfs
-    ):
+    others = {b.class_name() for b in parameter.bsdfs} - {*DIFFERENTIATED_BY_PATH}
+    if kind in ATTACHED_INTEGRATORS and others:
         return f"{kind} does not differentiate which part of a {name} it samples; {TO_SPLATPATH}"
     return None
 

@@ -172,7 +172,10 @@ class ProbeTransport(SplatTransport):
         splats: SplatsState, scene: mi.Scene, num_paths: int, sensors: Sequence[mi.Sensor]
     ) -> ProbeTransport:
         """Return the transport by probes; sensors: of flat mirrors. PluginError for unknown ids."""
-        objects = _objects(scene, splats.lighting.probes)
+        nodes: list[mi.Emitter | mi.Shape] = [*scene.emitters(), *scene.shapes()]
+        names, known = splats.lighting.probes, {node.id(): node for node in nodes}
+        check_ids("probes must be ids of the scene's shapes and emitters", names, nodes)
+        objects = [known[name] for name in names]
         shapes = {k: node for k, node in enumerate(objects) if isinstance(node, mi.Shape)}
         emitters = {k: shapes[k].emitter() if k in shapes else o for k, o in enumerate(objects)}
         states = [read_sensor(sensor, splats.near).detach() for sensor in sensors]
@@ -345,13 +348,6 @@ def _places(
         for k, mirror in specular.items():
             centers[k], planes[k] = mirror.mirror_camera(camera)
     return centers, planes
-
-
-def _objects(scene: mi.Scene, names: Sequence[str]) -> list[mi.Emitter | mi.Shape]:
-    nodes: list[mi.Emitter | mi.Shape] = [*scene.emitters(), *scene.shapes()]
-    check_ids("probes must be ids of the scene's shapes and emitters", names, nodes)
-    known = {node.id(): node for node in nodes}
-    return [known[name] for name in names]
 
 
 def check_ids(parameter: str, names: Sequence[str], nodes: Sequence[mi.Object]) -> None:

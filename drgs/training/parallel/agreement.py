@@ -64,7 +64,13 @@ def check_scene(
     for name, value in parameters.items():
         array = np.asarray(value)  # an object, where it is no array
         own[name] = str(value) if array.dtype == object else _digest(array.tobytes())
-    own |= {"settings": str(integrator), "cameras": _digest_of_cameras(views)}
+    cameras = [
+        [view.name, view.width, view.height, view.K.tolist(), view.camera_to_world.tolist()]
+        + ([] if view.lens is None else [view.lens.kind, str(view.lens.coefficients())])
+        + ([] if view.motion is None else [view.motion.close_to_world.tolist()])
+        for view in views
+    ]
+    own |= {"settings": str(integrator), "cameras": _digest(json.dumps(cameras).encode())}
     first = json.loads(comm.broadcast_text(json.dumps(own)))
     check_versions({name: first[name] for name in versions()})
     if other := [name for name in {**first, **own} if first.get(name) != own.get(name)]:
@@ -78,16 +84,6 @@ def differs_error(file: object, differences: Sequence[object]) -> UserError:
         f"{file}: not the same on {platform.node()} as for process 0: {format_names(differences)}; "
         "all processes must see the same files and options"
     )
-
-
-def _digest_of_cameras(views: Sequence[Viewpoint]) -> str:
-    cameras = [
-        [view.name, view.width, view.height, view.K.tolist(), view.camera_to_world.tolist()]
-        + ([] if view.lens is None else [view.lens.kind, str(view.lens.coefficients())])
-        + ([] if view.motion is None else [view.motion.close_to_world.tolist()])
-        for view in views
-    ]
-    return _digest(json.dumps(cameras).encode())
 
 
 def _digest(content: bytes) -> str:

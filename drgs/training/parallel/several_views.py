@@ -121,8 +121,16 @@ class SeveralViews:
     def finish(self, names: Sequence[Sequence[str]]) -> list[ViewGradients]:
         """Return all views' gradients, whose sum the parameters have; names: planes by view."""
         for each, weights in zip(self._views, names, strict=True):
-            if each.renderer != self.comm.rank:
-                self._receive_results(each, weights)
+            if each.renderer == self.comm.rank:
+                continue
+            times = range(len(each.local))
+            for time, local in enumerate(each.local):
+                width = local.num_stored - local.num_keys
+                columns = self._exchange.receive_columns(each, time, width)
+                each.gradients.append(local.gradients(columns))
+            for name in weights:
+                sums = [self._exchange.receive_columns(each, time, 1)[0] for time in times]
+                each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
         self._add_all()
         self._exchange.finish()
         results = []
@@ -167,16 +175,6 @@ class SeveralViews:
                 each.local.append(LocalSplats(camera, pipeline, table.boxes, *counts))
                 splats.append(table)
         return splats
-
-    def _receive_results(self, each: _View, weights: Sequence[str]) -> None:
-        """Receive derivatives and weighted sums of this rank's rows from the view's renderer."""
-        for time, local in enumerate(each.local):
-            columns = self._exchange.receive_columns(each, time, local.num_stored - local.num_keys)
-            each.gradients.append(local.gradients(columns))
-        for name in weights:
-            times = range(len(each.local))
-            sums = [self._exchange.receive_columns(each, time, 1)[0] for time in times]
-            each.sums[name] = sum(sums[1:], sums[0]) / len(sums)
 
     def _add_all(self) -> None:
         """Add the derivatives of all views to the parameters', a group at a time."""
