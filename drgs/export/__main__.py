@@ -6,8 +6,8 @@ Exports files, or a fit's file for other programs (``drgs.fit.viewers_fit``), in
 
 from __future__ import annotations
 
-import argparse
 import sys
+from argparse import Namespace
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
@@ -60,7 +60,7 @@ class ExportTarget:
 
     suffix: str  # of files, in small letters; added to the input's name
     text: str  # description, one phrase
-    encode: Callable[[ExportSource, Path, argparse.Namespace], Mapping[str, bytes]]
+    encode: Callable[[ExportSource, Path, Namespace], Mapping[str, bytes]]
     """Function of the Gaussians, the output file and all arguments to files by name, relative to
     the output's folder; deterministic."""
     up: np.ndarray  # (3,) in programs
@@ -84,14 +84,12 @@ def targets() -> dict[str, ExportTarget]:
     return {**formats, **MADE_TARGETS}
 
 
-def _encode_format(
-    name: str, source: ExportSource, out: Path, _: argparse.Namespace
-) -> dict[str, bytes]:
+def _encode_format(name: str, source: ExportSource, out: Path, _: Namespace) -> dict[str, bytes]:
     content = source.gaussians.to_bytes(name)
     return sog.unpack(content) if _is_named(out, sog.META) else {out.name: content}
 
 
-def _encode_page(source: ExportSource, out: Path, _: argparse.Namespace) -> dict[str, bytes]:
+def _encode_page(source: ExportSource, out: Path, _: Namespace) -> dict[str, bytes]:
     """Encode a page with the first view and the background of the fit; else black."""
     gaussians, config = source.gaussians, source.config
     if source.cameras is not None and source.up is None:
@@ -104,7 +102,7 @@ def _encode_page(source: ExportSource, out: Path, _: argparse.Namespace) -> dict
     return {out.name: viewer_page(title, shown, initial_view, background)}
 
 
-def _encode_mesh(source: ExportSource, out: Path, args: argparse.Namespace) -> dict[str, bytes]:
+def _encode_mesh(source: ExportSource, out: Path, args: Namespace) -> dict[str, bytes]:
     """Encode the surface that the fit's training cameras see; for a file, cameras around it."""
     from drgs.export import mesh as surface
 
@@ -119,31 +117,27 @@ def _encode_mesh(source: ExportSource, out: Path, args: argparse.Namespace) -> d
     return {out.name: encode(mesh, source.gaussians.origin)}
 
 
-def _encode_levels(source: ExportSource, _: Path, args: argparse.Namespace) -> dict[str, bytes]:
+def _encode_levels(source: ExportSource, _: Path, args: Namespace) -> dict[str, bytes]:
     most, count = source.gaussians.num_gaussians, args.levels or DEFAULT_LEVELS
     levels = [reduce_to(source, -(-most // 2**k), args.variant) for k in range(count)]
     return encode_levels([each.gaussians for each in levels])
 
 
-_LEVELS_TEXT = f"levels of detail as PlayCanvas streams them, {LOD_META} beside folders of SOG"
-_PAGE_TEXT = "a page to walk around in, for any browser"
-_MESH_TEXT = "the surface as triangles with colours (.ply or .glb)"
+def _honour_all(_: Approximations) -> frozenset[str]:
+    return frozenset(DECLARED)
+
+
+_LOD = f"levels of detail as PlayCanvas streams them, {LOD_META} beside folders of SOG"
+_PAGE = "a page to walk around in, for any browser"
+_MESH = "the surface as triangles with colours (.ply or .glb)"
 MADE_TARGETS = {
-    "html": ExportTarget(".html", _PAGE_TEXT, _encode_page, Z_UP, honoured=lambda _: HONOURED),
-    "mesh": ExportTarget(
-        ".ply", _MESH_TEXT, _encode_mesh, Z_UP, honoured=lambda _: frozenset(DECLARED)
-    ),
+    "html": ExportTarget(".html", _PAGE, _encode_page, Z_UP, False, lambda _: HONOURED),
+    "mesh": ExportTarget(".ply", _MESH, _encode_mesh, Z_UP, False, _honour_all),
     "lod": ExportTarget(
-        f"_levels/{LOD_META}",
-        _LEVELS_TEXT,
-        _encode_levels,
-        Y_DOWN,
-        honoured=_honoured_by_playcanvas,
+        f"_levels/{LOD_META}", _LOD, _encode_levels, Y_DOWN, False, _honoured_by_playcanvas
     ),
 }
-STATISTICS_ONLY = ExportTarget(
-    "", "no file", lambda *_: {}, Z_UP, honoured=lambda _: frozenset(DECLARED)
-)
+STATISTICS_ONLY = ExportTarget("", "no file", lambda *_: {}, Z_UP, False, _honour_all)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -162,14 +156,9 @@ def add_arguments(parser: CommandParser) -> None:
         "%(prog)s out/lego --levels 4 --out web/lod-meta.json",
         "%(prog)s a.ply b.ply --rotate 0 0 90 --filter-value opacity,gt,0.1 --out both.sog",
     )
-    parser.add_argument(
-        "what",
-        nargs="+",
-        type=file_or_folder,
-        metavar="OUT_DIR|MODEL",
-        help="the output folder of a fit, or a file of Gaussians; several are merged",
-    )
     add = parser.add_argument
+    text = "the output folder of a fit, or a file of Gaussians; several are merged"
+    add("what", nargs="+", type=file_or_folder, metavar="OUT_DIR|MODEL", help=text)
     names = "; ".join(f"{name}: {target.text}" for name, target in targets().items())
     add("--format", metavar="NAME", help=f"{names} (default: by the suffix of --out)")
     text = "output file (default: the name of the input, with the suffix of the format)"
@@ -188,7 +177,7 @@ def add_arguments(parser: CommandParser) -> None:
     parser.set_defaults(run=run)
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: Namespace) -> None:
     """Export what the command line names."""
     with redirect_stdout(sys.stderr if args.json else sys.stdout):
         target, out = _destination(args)
@@ -218,13 +207,11 @@ def _check_output(out: Path, names: Iterable[str], sources: Sequence[ExportSourc
     written = {(out.parent / name).resolve() for name in names}
     for each in sources:
         if each.path.resolve() in written:
-            raise UserError(
-                f"--out {out}: would replace {each.path}, the input; choose another name"
-            )
+            raise UserError(f"--out {out}: would replace {each.path}, an input; change the name")
     FolderRecord(out.parent, COMMAND).check(names)
 
 
-def _destination(args: argparse.Namespace) -> tuple[ExportTarget, Path]:
+def _destination(args: Namespace) -> tuple[ExportTarget, Path]:
     known, named = targets(), None if args.out is None else _target_name(args.out)
     name, options = args.format or named, [option for option, _ in args.steps]
     if args.levels is not None and name in (None, "sog"):
@@ -260,11 +247,10 @@ def _is_named(path: Path, name: str) -> bool:
 
 
 def _target_name(path: Path) -> str | None:
-    special = {sog.META: "sog", LOD_META: "lod"}.get(path.name.lower())
     if path.name.lower().endswith(".html"):
         return "html"
-    file_format = format_for(path)
-    return special or (None if file_format is None else file_format.name)
+    name, known = path.name.lower(), format_for(path)
+    return {sog.META: "sog", LOD_META: "lod"}.get(name, known and known.name)
 
 
 if __name__ == "__main__":

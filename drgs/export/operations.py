@@ -100,8 +100,13 @@ def _condition(text: str) -> Condition:
     return words[0], words[1], finite_number(words[2])
 
 
-def _voxel_filter(text: str, default: VoxelRule, apply: Any) -> Operation:
-    """Return the operation with the value ``SIZE,OPACITY,MIN``, of which any may be left out."""
+def _voxel_filter(name: str, default: VoxelRule, find: Any, text: str) -> Operation:
+    """Return the filter by ``SIZE,OPACITY,MIN``, any of which may be left out; find: a mask."""
+
+    def apply(source: ExportSource, find_rule: FindRule, args: Namespace) -> ExportSource:
+        rule = find_rule(source.gaussians)
+        mask = find(source.gaussians, rule, args.seed_pos)
+        return source.keep(f"{name} (voxels of {rule.size:.3g})", mask)
 
     def parse(text: str) -> FindRule:
         words = text.split(",")
@@ -170,19 +175,6 @@ def _filter_value(source: ExportSource, condition: Condition, _: Namespace) -> E
     name, comparison, number = condition
     mask = getattr(operator, comparison)(properties_of(source.gaussians)[name], number)
     return source.keep(f"{name} {comparison} {number:g}", mask)
-
-
-def _filter_floaters(source: ExportSource, find_rule: FindRule, _: Namespace) -> ExportSource:
-    rule = find_rule(source.gaussians)
-    mask = find_non_floaters(source.gaussians, rule)
-    return source.keep(f"floaters (voxels of {rule.size:.3g})", mask)
-
-
-def _filter_cluster(source: ExportSource, find_rule: FindRule, args: Namespace) -> ExportSource:
-    g, seed = source.gaussians, args.seed_pos
-    rule = find_rule(g)
-    mask = find_cluster(g, rule, None if seed is None else np.subtract(seed, g.origin))
-    return source.keep(f"cluster (voxels of {rule.size:.3g})", mask)
 
 
 def _limit_degree(source: ExportSource, degree: int, _: Namespace) -> ExportSource:
@@ -271,10 +263,16 @@ OPERATIONS = {
         {"type": _condition, "metavar": "NAME,COMPARISON,NUMBER"},
     ),
     "--filter-floaters": _voxel_filter(
-        "remove Gaussians that contribute less than MIN to every voxel", FLOATERS, _filter_floaters
+        "floaters",
+        FLOATERS,
+        lambda gaussians, rule, _: find_non_floaters(gaussians, rule),
+        "remove Gaussians that contribute less than MIN to every voxel",
     ),
     "--filter-cluster": _voxel_filter(
-        "keep the Gaussians that contribute MIN to the cluster of voxels", CLUSTER, _filter_cluster
+        "cluster",
+        CLUSTER,
+        lambda g, rule, seed: find_cluster(g, rule, seed and np.subtract(seed, g.origin)),
+        "keep the Gaussians that contribute MIN to the cluster of voxels",
     ),
     "--sh-degree": Operation(
         "leave out harmonics of higher degrees, 0 to 3",

