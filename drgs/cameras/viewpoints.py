@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -77,18 +77,16 @@ class Viewpoint:
 
     def with_offset(self, offset: np.ndarray) -> Self:
         """Return the same camera with ``offset`` (3,) added to its position."""
-        if not np.any(offset):
-            return self
-        pose, motion = _translate_pose(self.camera_to_world, offset), self.motion
+        shift = np.zeros((4, 4))
+        shift[:3, 3] = offset
+        return self.with_poses(lambda pose: pose + shift) if np.any(offset) else self
+
+    def with_poses(self, change: Callable[[np.ndarray], np.ndarray]) -> Self:
+        """Return the same camera, whose poses (4, 4) ``change`` maps to others."""
+        motion = self.motion
         if motion is not None:
-            motion = replace(motion, close_to_world=_translate_pose(motion.close_to_world, offset))
-        return replace(self, camera_to_world=pose, motion=motion)
-
-
-def _translate_pose(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    pose = pose.copy()
-    pose[:3, 3] += offset
-    return pose
+            motion = replace(motion, close_to_world=change(motion.close_to_world))
+        return replace(self, camera_to_world=change(self.camera_to_world), motion=motion)
 
 
 def pinhole(name: str, pose: np.ndarray, width: int, height: int, fov: float) -> Viewpoint:

@@ -41,6 +41,7 @@ class CommandParser(argparse.ArgumentParser):
 
     def __init__(self, *, module: str | None = None, **settings: Any) -> None:
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **settings)
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # argparse's lacks -1e-3
         self._module = module
         self._subcommands: tuple[str, ...] = ()
         self.more_help: Callable[[], str] = str  # ends the help; called when this is shown

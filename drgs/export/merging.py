@@ -6,6 +6,7 @@ neighbours. The cost is in closed form here instead of by sampling.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -61,11 +62,26 @@ def merge_down(gaussians: Gaussians[np.ndarray], count: int) -> Gaussians[np.nda
         masses = np.concatenate([masses[rest], joint])
     kept = take(gaussians, rows)
     merged = _from_moments(*(values[len(rows) :] for values in (means, covariances, masses, sh)))
-    joined = {
-        name: np.concatenate([getattr(kept, name), getattr(merged, name)])
-        for name in PARAMETER_NAMES
-    }
-    return replace(kept, **joined)
+    return concatenate([kept, merged])
+
+
+def concatenate(parts: Sequence[Gaussians[np.ndarray]]) -> Gaussians[np.ndarray]:
+    """Return the Gaussians of all parts, with zeros for harmonics that a part lacks.
+
+    Their origin and settings are those of the first part.
+    """
+    count = max(part.shN.shape[1] for part in parts)
+    padded = [
+        replace(part, shN=np.pad(part.shN, ((0, 0), (0, count - part.shN.shape[1]), (0, 0))))
+        for part in parts
+    ]
+    arrays = {n: np.concatenate([getattr(part, n) for part in padded]) for n in PARAMETER_NAMES}
+    return replace(parts[0], **arrays)
+
+
+def world_means(gaussians: Gaussians[np.ndarray]) -> np.ndarray:
+    """Return the means (N, 3) in the world, float64."""
+    return gaussians.means.astype(np.float64) + gaussians.origin
 
 
 def take(gaussians: Gaussians[np.ndarray], rows: np.ndarray) -> Gaussians[np.ndarray]:

@@ -192,7 +192,8 @@ def test_options_select_the_exported_gaussians(model):
     inside = ((g.means >= -1) & (g.means <= [1, 1, 2])).all(axis=1)
     kept = inside & (g.opacities >= 0.2) & (g.scales.max(axis=1) <= 0.3)
     assert 0 < kept.sum() < 300
-    assert f"kept: {kept.sum()}; left out by box {(~inside).sum()}, opacity " in outcome.stdout
+    assert f"kept: {inside.sum()}; left out by box {(~inside).sum()}" in outcome.stdout
+    assert f"kept: {kept.sum()}; left out by size le 0.3 " in outcome.stdout
     assert Gaussians.load(out).means.tolist() == g.means[kept].tolist()
 
 
@@ -207,17 +208,24 @@ def test_floaters_and_clusters_are_removed_in_world_coordinates(tmp_path):
     g = Gaussians.from_numpy(means, quats, scales, opacities, np.zeros((291, 1, 3)))
     replace(g, origin=far).save(tmp_path / "model.ply")
     out = tmp_path / "out.ply"
-    for options, kept, said in (
-        (["--filter-floaters"], 290, "floaters (voxels of 0.0"),
+    for options, kept, said, left_out in (
+        (["--filter-floaters"], 290, "floaters (voxels of 0.0", 1),
         (
             ["--filter-floaters", "0.2", "--filter-cluster", "0.4,0.5"],
             200,
-            "floaters (voxels of 0.2) 1",
+            "cluster (voxels of 0.4)",
+            90,
         ),
-        (["--filter-cluster", "0.4,0.5", "--seed-pos", 1005, 0, 0], 90, "cluster (voxels of 0.4)"),
+        (
+            ["--filter-cluster", "0.4,0.5", "--seed-pos", 1005, 0, 0],
+            90,
+            "cluster (voxels of 0.4)",
+            201,
+        ),
     ):
         outcome = run(tmp_path / "model.ply", "--out", out, *options)
         assert f"kept: {kept}; left out by {said}" in outcome.stdout
+        assert f") {left_out}\n" in outcome.stdout
         assert Gaussians.load(out).num_gaussians == kept
 
 
@@ -262,7 +270,7 @@ def test_folders_of_levels_that_are_foreign_are_kept(model):
         run(model, "--out", source)
     message = "holds 0_0/meta.json, 1_0/meta.json, which"
     out = model.parent / "mine" / "lod-meta.json"
-    words = (source, "--levels", 2, "--out", out)
+    words = (model, "--levels", 2, "--out", out)
     assert_refused(export.main, *words, folder=model.parent, message=message)
 
 
@@ -317,32 +325,40 @@ def test_up_direction_uses_refined_cameras(fit, optimise):
 
 TO_SPZ = ("model.ply", "--format", "spz")
 REFUSED = [
-    (("model.ply",), "one of compressed-ply, glb, ply, sog, splat, spz, usd, html, mesh, got none"),
+    (
+        ("model.ply",),
+        "one of compressed-ply, glb, ply, sog, splat, spz, usd, html, mesh, lod, got none",
+    ),
     (("model.ply", "--format", "splt"), "got splt; did you mean splat?"),
     (("model.ply", "--out", "a.obj"), "--format: must be one of"),
     ((*TO_SPZ, "--out", "a.glb"), "name of a spz file must end in .spz"),
     (("model.ply", "--format", "ply", "--out", "a.compressed.ply"), "that of a compressed-ply"),
-    (("model.ply", "--format", "ply"), "model.ply: is the input; choose another name"),
+    (("model.ply", "--format", "ply"), "would replace model.ply, an input; change the name"),
     (("none.ply", "--format", "spz"), "none.ply: there is no such file or folder"),
     ((".", "--format", "spz"), "must be the output folder of a fit that has ended"),
     ((*TO_SPZ, "--up", "cameras"), "--up cameras: needs the output"),
     ((*TO_SPZ, "--up", 0, 0, 0), "--up: must be cameras, or thr"),
-    ((*TO_SPZ, "--min-opacity", 2), "nothing is left; crop and filt"),
-    ((*TO_SPZ, "--max-size", 1e-9), "nothing is left; crop and filt"),
+    ((*TO_SPZ, "--min-opacity", 2), "nothing is left of 300 Gaussians by opacity ge 2; crop and"),
+    ((*TO_SPZ, "--max-size", 1e-9), "nothing is left of 300 Gaussians by size le 1e-09"),
     ((*TO_SPZ, "--filter-floaters", 0), "SIZE must be above 0, OPACITY above 0 and below 1, MI"),
     ((*TO_SPZ, "--filter-floaters", "0.1,0.5,-1"), "MIN at least 0, got 0.1,0.5,-1"),
     ((*TO_SPZ, "--filter-cluster", "1,0.5,0,4"), "must be at most SIZE,OPACITY,MIN, got 1,0.5,0,4"),
     ((*TO_SPZ, "--filter-cluster", 1e-7), "--filter-cluster: voxels of 1e-07 are too small: the"),
     (("--filter-cluster", *TO_SPZ), "must be a finite number, got model.ply"),
-    ((*TO_SPZ, "--filter-cluster", "0.1,0.9999999"), "nothing is left; crop and filter less"),
+    ((*TO_SPZ, "--filter-cluster", "0.1,0.9999999"), "(voxels of 0.1); crop and filter less"),
     ((*TO_SPZ, "--seed-pos", 0, 0, 0), "--seed-pos: needs --filter-cluster"),
     ((*TO_SPZ, "--filter-cluster", "--seed-pos", 1, 2), "expected 3 arguments: --seed-pos X Y Z"),
     ((*TO_SPZ, "--decimate", 0), "--decimate: must be a whole number >= 1, got 0"),
     ((*TO_SPZ, "--decimate", "0%"), "must be above 0% and at most 100%, got 0%"),
     (("model.ply", "--levels", 1), "--levels: must be a whole number >= 2, got 1"),
-    ((*TO_SPZ, "--levels", 2), "--levels: writes SOG, got --format spz; leave it out"),
-    (("model.ply", "--levels", 2, "--out", "a.sog"), "lod-meta.json, got --out a.sog"),
-    (("model.ply", "--out", "lod-meta.json"), "levels of detail; give --levels N"),
+    ((*TO_SPZ, "--levels", 2), "--levels: needs --format lod; add that, or leave --levels out"),
+    (("model.ply", "--levels", 2, "--out", "a.sog"), "lod-meta.json, got that of a sog file"),
+    ((*TO_SPZ, "--json"), "--json: needs --info; add that, or leave --json out"),
+    ((*TO_SPZ, "--scale", 1e39), "of Gaussian 0 is"),
+    (
+        (*TO_SPZ, "--filter-value", "opacty,gt,1"),
+        "comparison of lt, le, gt, ge, eq, ne, got opacty",
+    ),
     ((*TO_SPZ, "--out", "web/meta.json"), "must end in .spz, got that of a sog file"),
 ]
 
@@ -440,7 +456,7 @@ def test_mesh_is_where_the_gaussians_are(fit, tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", ["meta.json", "lod-meta.json"])
 def test_a_stop_at_any_file_leaves_one_model_or_none(tmp_path, monkeypatch, kind):
     """An earlier export is there until all of the new one is on the disk."""
-    monkeypatch.setattr(export, "reduce_to", lambda source, count, axis: source)
+    monkeypatch.setattr(export, "reduce_to", lambda source, count, variant: source)
     for seed, name in enumerate("ab"):
         gaussians_within_ranges(60, degree=0, seed=seed).save(tmp_path / f"{name}.ply")
     out, levels = tmp_path / "web" / kind, ["--levels", "2"] if kind.startswith("lod") else []

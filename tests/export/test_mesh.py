@@ -187,8 +187,8 @@ REFUSED = [
     (("--out", "a.spz"), "--out a.spz: the name of a mesh file must end in .ply or .glb, got that"),
     (("--out", "a.obj"), "--out a.obj: the name of a mesh file must end in .ply or .glb, got that"),
     (("--out", "a.compressed.ply"), "the name of a mesh file must end in .ply or .glb, got that "),
-    (("--format", "spz", "--mesh-size", 64), "--mesh-size: is for --format mesh, got spz; leave"),
-    (("--min-opacity", 1), "nothing is left; crop and filter less"),
+    (("--format", "spz", "--mesh-size", 64), "--mesh-size: needs --format mesh; add that, or"),
+    (("--min-opacity", 1), "nothing is left of 20 Gaussians"),
     ((), "--format mesh: needs skimage, which is not installed; pip install 'drgs[mesh]'"),
 ]
 
