@@ -113,9 +113,10 @@ class LeanAdam(Adam):
 
 
 class NesterovAdam(LeanAdam):
-    """Adam with steps along Nesterov's momentum, and its own correction of bias (Dozat 2016).
+    """Adam with steps along Nesterov's momentum (Dozat 2016).
 
-    That is the first moment as it would be after one more step with the same gradient.
+    That is the first moment as it would be after one more step with the same gradient, without
+    the bias that it would have.
     """
 
     @override
@@ -127,9 +128,10 @@ class NesterovAdam(LeanAdam):
         lr: LearningRate,
         extra: _State,
     ) -> tuple[dr.ArrayBase, _State]:
-        first = dr.lerp(grad, extra[1], self.beta_1)
-        new, state = super()._step(cache, value, grad, lr, (extra[0], first, *extra[2:]))
-        return new, (state[0], first, *state[2:])
+        count, first = extra[0] + 1, dr.lerp(grad, extra[1], self.beta_1)
+        rate = lr * ((1 - self.beta_1**count) / (1 - self.beta_1 ** (count + 1)))
+        new, state = super()._step(cache, value, grad, rate, (extra[0], first, *extra[2:]))
+        return new, (count, first, *state[2:])
 
 
 def make_optimizer(

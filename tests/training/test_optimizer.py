@@ -63,14 +63,14 @@ def test_make_optimizer_sets_rates_and_leaves_out_empty_parameters():
 
 
 def test_steps_are_along_nesterov_s_momentum():
-    """After Dozat 2016, in float64; the first moment's bias is corrected as in Adam."""
+    """After Dozat 2016, in float64; the bias is that of the moment one step ahead."""
     optimizer, rows = make_optimizer(parameters(4), RATES), np.arange(4)
     value, first, second = parameters(4)["log_scales"].numpy().astype(np.float64), 0.0, 0.0
     for seed in range(5):
         step(optimizer, seed, rows)
         gradient = np.random.default_rng([seed, len("log_scales")]).standard_normal((100, 3))[:4]
         first, second = 0.9 * first + 0.1 * gradient, 0.999 * second + 0.001 * gradient**2
-        ahead = (0.9 * first + 0.1 * gradient) / (1 - 0.9 ** (seed + 1))
+        ahead = (0.9 * first + 0.1 * gradient) / (1 - 0.9 ** (seed + 2))
         value -= RATES["log_scales"] * ahead / np.sqrt(second / (1 - 0.999 ** (seed + 1)))
         found, moment, _ = snapshot(optimizer)["log_scales"]
         np.testing.assert_allclose(found, value, atol=2e-6)

@@ -74,7 +74,8 @@ def test_step_is_adam_on_the_mean_gradient_with_scaled_rates_and_decays():
         for name, value in before.items():
             g = np.mean([gradient[name] for gradient in gradients], axis=0)
             m[name], v[name] = b1 * m[name] + (1 - b1) * g, b2 * v[name] + (1 - b2) * g * g
-            change = m[name] / (1 - b1**t) / (np.sqrt(v[name] / (1 - b2**t)) + 1e-15)
+            ahead = (b1 * m[name] + (1 - b1) * g) / (1 - b1 ** (t + 1))
+            change = ahead / (np.sqrt(v[name] / (1 - b2**t)) + 1e-15)
             rate = np.sqrt(views_per_step) * expected_rates[name]
             rate *= 1 if name == "means" else falls
             # Gradients that are rounding noise still make full steps of Adam.
