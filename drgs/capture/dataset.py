@@ -225,7 +225,9 @@ def spread_first(views: list[CaptureView]) -> list[CaptureView]:
 
 def write_points(path: Path, positions: np.ndarray, colors: np.ndarray) -> None:
     """Write a PLY of points: positions (N, 3) world, colours (N, 3) uint8 display space."""
-    rows = np.rec.fromarrays([*positions.T, *colors.T], names=[*POSITION, *COLOR])
+    columns = dict(zip((*POSITION, *COLOR), (*positions.T, *colors.T), strict=True))
+    dtype = [(name, column.dtype) for name, column in columns.items()]
+    rows = np.rec.fromarrays(list(columns.values()), dtype=dtype)
     with atomic_path(path) as temporary:
         temporary.write_bytes(encode_elements({"vertex": rows}))
 

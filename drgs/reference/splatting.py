@@ -346,9 +346,7 @@ def project(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
         opacities = opacities * areas / np.sqrt(dets)
     means2d, visible = camera.film_points(affine.means), affine.in_front & (opacities > ALPHA_CUT)
     depths = (gaussians.means - camera.center) @ camera.rotation[2]
-    a, b, c = cov2d[:, 0, 0] / dets, cov2d[:, 0, 1] / dets, cov2d[:, 1, 1] / dets
-    conics = _rows_of_matrices([c, -b], [-b, a])  # the inverses of cov2d
-    return Projection(means2d, cov2d, conics, depths, opacities, visible)
+    return Projection(means2d, cov2d, _inverses(cov2d, dets), depths, opacities, visible)
 
 
 def widened_covariances(
@@ -369,6 +367,12 @@ def widened_covariances(
     dets = areas**2 + t[:, 0] * np.sum(y**2, axis=-1) + t[:, 1] * np.sum(x**2, axis=-1)
     cov2d = axes2d @ _transpose(axes2d) + t[:, :, None] * np.eye(2)
     return cov2d, dets + t[:, 0] * t[:, 1], areas
+
+
+def _inverses(matrices: np.ndarray, dets: np.ndarray) -> np.ndarray:
+    """Return the inverses of symmetric matrices (N, 2, 2) whose determinants (N,) are given."""
+    a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
+    return _rows_of_matrices([c / dets, -b / dets], [-b / dets, a / dets])
 
 
 # ---- Compositing -----------------------------------------------------------------------------
