@@ -11,10 +11,10 @@ NAMES = Counter(path.stem for path in FILES if path.stem.startswith("test_"))
 
 MAX_FILE_LINES = 600
 
-OTHER_FOLDERS = {"support", "references", "commands", "scenes", "house"}
+OTHER_FOLDERS = {"support", "references", "commands", "scenes", "house", "examples"}
 """Beside those that are named like a package: ``support`` is what tests share, ``references`` are
-stored images, ``commands`` run the programs, ``scenes`` are the shipped ones, ``house`` is about
-the repository itself."""
+stored images, ``commands`` run the programs, ``scenes`` are the shipped ones, ``examples`` tests
+the programs there, ``house`` is about the repository itself."""
 
 
 def test_no_file_imports_a_test_file():
