@@ -6,14 +6,13 @@ neighbours. The cost is in closed form here instead of by sampling.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.parameters import Gaussians
 
 NUM_NEIGHBOURS = 12
 PAIRS_AT_ONCE = 1 << 18
@@ -60,35 +59,14 @@ def merge_down(gaussians: Gaussians[np.ndarray], count: int) -> Gaussians[np.nda
         sh = np.concatenate([sh[rest], _mix(sh, a, b, share)])
         covariances = np.concatenate([covariances[rest], merged])
         masses = np.concatenate([masses[rest], joint])
-    kept = take(gaussians, rows)
     merged = _from_moments(*(values[len(rows) :] for values in (means, covariances, masses, sh)))
-    return concatenate([kept, merged])
-
-
-def concatenate(parts: Sequence[Gaussians[np.ndarray]]) -> Gaussians[np.ndarray]:
-    """Return the Gaussians of all parts, with zeros for harmonics that a part lacks.
-
-    Their origin and settings are those of the first part.
-    """
-    count = max(part.shN.shape[1] for part in parts)
-    padded = [
-        replace(part, shN=np.pad(part.shN, ((0, 0), (0, count - part.shN.shape[1]), (0, 0))))
-        for part in parts
-    ]
-    arrays = {n: np.concatenate([getattr(part, n) for part in padded]) for n in PARAMETER_NAMES}
-    return replace(parts[0], **arrays)
+    merged = replace(merged, origin=gaussians.origin)
+    return Gaussians.concatenate([gaussians[rows], merged])
 
 
 def world_means(gaussians: Gaussians[np.ndarray]) -> np.ndarray:
     """Return the means (N, 3) in the world, float64."""
     return gaussians.means.astype(np.float64) + gaussians.origin
-
-
-def take(gaussians: Gaussians[np.ndarray], rows: np.ndarray) -> Gaussians[np.ndarray]:
-    """Return some of the Gaussians; rows: indices, or a mask (N,)."""
-    arrays = {k: v[rows] for k, v in vars(gaussians).items() if isinstance(v, np.ndarray)}
-    features = gaussians.features and {k: v[rows] for k, v in gaussians.features.items()}
-    return replace(gaussians, **arrays, features=features)
 
 
 def shapes_of(gaussians: Gaussians[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

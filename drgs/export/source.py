@@ -16,7 +16,7 @@ from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, note_user
 from drgs.core.origin import WORLD, recenter_means
 from drgs.effects.smoothing import bake_smoothing
-from drgs.export.merging import concatenate, take, world_means
+from drgs.export.merging import world_means
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.similarity import Similarity, shortest_rotation
 from drgs.results.folder import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, load_run_config, require_results
@@ -87,7 +87,7 @@ class ExportSource:
                 f"{self.path}: nothing is left of {gone:,} Gaussians by {criterion}; crop and "
                 "filter less"
             )
-        return replace(self, gaussians=take(self.gaussians, mask))
+        return replace(self, gaussians=self.gaussians[mask])
 
 
 def merge_sources(sources: Sequence[ExportSource]) -> ExportSource:
@@ -103,7 +103,7 @@ def merge_sources(sources: Sequence[ExportSource]) -> ExportSource:
                 "used for both"
             )
     parts = [each.gaussians for each in sources]
-    gaussians = concatenate(parts)
+    gaussians = Gaussians.concatenate(parts)
     means = np.concatenate([world_means(part) for part in parts])
     return ExportSource(replace(gaussians, means=means, origin=WORLD), first.path).translate(0.0)
 

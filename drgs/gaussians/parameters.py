@@ -7,7 +7,7 @@ files give them; no Dr.Jit backend is touched) or Dr.Jit arrays, from which stag
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
@@ -168,6 +168,38 @@ class Gaussians(Generic[Tensor]):
             sh0=sh[:, :1],
             shN=sh[:, 1:],
         )
+
+    @staticmethod
+    def concatenate(parts: Sequence[Gaussians[Any]]) -> Gaussians[np.ndarray]:
+        """Return the Gaussians of all parts as numpy arrays, with zeros for harmonics they lack.
+
+        Origin and ``rendered_with`` are those of the first part. Features and the smoothing filter
+        are left out where a part has none.
+        """
+        first, hosts, arrays = parts[0], [part.numpy() for part in parts], {}
+        count = max(host.shN.shape[1] for host in hosts)
+        for name in set.intersection(*(set(host.arrays) for host in hosts)):
+            values = [host.arrays[name] for host in hosts]
+            if name == "means":
+                values = [h.means + np.subtract(h.origin, first.origin) for h in hosts]
+            elif name == "shN":
+                values = [np.pad(v, ((0, 0), (0, count - v.shape[1]), (0, 0))) for v in values]
+            arrays[name] = np.concatenate(values).astype(hosts[0].arrays[name].dtype)
+        whole = Gaussians.from_arrays(arrays)
+        return replace(whole, rendered_with=first.rendered_with, origin=first.origin)
+
+    def __len__(self) -> int:
+        """Return N."""
+        return self.num_gaussians
+
+    def __getitem__(self, rows: Any) -> Gaussians[np.ndarray]:
+        """Return some of the Gaussians as numpy arrays.
+
+        rows: a mask (N,), indices, a slice or a number.
+        """
+        host, rows = self.numpy(), np.atleast_1d(np.arange(self.num_gaussians)[rows])
+        some = Gaussians.from_arrays({name: array[rows] for name, array in host.arrays.items()})
+        return replace(some, rendered_with=self.rendered_with, origin=self.origin)
 
     @property
     def num_gaussians(self) -> int:

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from drgs.bench.output import machine, markdown_table
 from drgs.export.decimation import decimate
-from drgs.export.merging import merge_down, take
+from drgs.export.merging import merge_down
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import make_scene, make_sensors, render_views
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
@@ -52,7 +52,7 @@ def curves(folder: Path) -> dict[str, list[float]]:
     }
 
     def drop(score: np.ndarray, count: int) -> Gaussians:
-        return take(whole, np.sort(np.argsort(-score, kind="stable")[:count]))
+        return whole[np.sort(np.argsort(-score, kind="stable")[:count])]
 
     methods = {
         "merged and fitted": lambda n: decimate(whole, n, dataset.train, *surroundings),

@@ -9,7 +9,6 @@ from support.formats import gaussians_within_ranges
 
 from drgs.export import levels
 from drgs.export.levels import LOD_META, encode_levels
-from drgs.export.merging import take
 from drgs.gaussians.parameters import Gaussians
 
 
@@ -43,7 +42,7 @@ def test_leaves_name_all_gaussians_once_with_their_boxes(monkeypatch, tmp_path, 
     g = gaussians_within_ranges(300)
     means = np.random.default_rng(1).normal(size=(300, 3)) * [5, 1, 1]
     g = Gaussians(**{**vars(g), "means": means.astype(np.float32)})
-    parts = [g, take(g, np.arange(0, 300, 2)), take(g, np.arange(7))]
+    parts = [g, g[::2], g[:7]]
     files = encode_levels(parts)
     assert list(files)[-1] == LOD_META and files == encode_levels(parts)
     meta, read = written(tmp_path, files)
@@ -57,9 +56,9 @@ def test_leaves_name_all_gaussians_once_with_their_boxes(monkeypatch, tmp_path, 
             assert meta["filenames"][lod["file"]].startswith(f"{level}_")
             rows = np.arange(lod["offset"], lod["offset"] + lod["count"])
             used[lod["file"]][rows] += 1
-            own = take(read[lod["file"]], rows)
+            own = read[lod["file"]][rows]
             distance = np.linalg.norm(own.means[:, None] - parts[int(level)].means, axis=2)
-            source = take(parts[int(level)], distance.argmin(axis=1))
+            source = parts[int(level)][distance.argmin(axis=1)]
             assert distance.min(axis=1).max() < 1e-3  # 16 bits of log(1 + |x|), |x| < 20
             sides = half_sides(source)
             # Means and scales are float32.
@@ -72,7 +71,7 @@ def test_gaussians_at_one_place_are_one_leaf(monkeypatch):
     monkeypatch.setattr(levels, "LEAF_SIZE", 10)
     g = gaussians_within_ranges(20)
     g = Gaussians(**{**vars(g), "means": 0 * g.means})
-    tree = json.loads(encode_levels([g, take(g, [1])])[LOD_META])["tree"]
+    tree = json.loads(encode_levels([g, g[[1]]])[LOD_META])["tree"]
     assert tree["lods"] == {
         "0": {"file": 0, "offset": 0, "count": 20},
         "1": {"file": 1, "offset": 0, "count": 1},

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.formats import gaussians_within_ranges
 
-from drgs.export.merging import merge_down, take
+from drgs.export.merging import merge_down
 
 
 def covariances_of(g):
@@ -41,7 +41,7 @@ def test_a_pair_keeps_mean_covariance_mass_and_mean_colour():
 def test_twins_are_merged_first():
     g = gaussians_within_ranges(100, degree=1)
     g = replace(g, logit_opacities=g.logit_opacities - 4.5)  # whose masses fit into one
-    twins = take(g, np.repeat(np.arange(100), 2))
+    twins = g[np.repeat(np.arange(100), 2)]
     found = merge_down(twins, 100)
     order = [np.argsort(each.means[:, 0]) for each in (g, found)]
     # Float32; a logit near -4.5 keeps six digits of an opacity.

@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.formats import gaussians_within_ranges
 
-from drgs.export.merging import take
 from drgs.export.voxels import FLOATERS, VoxelRule, find_cluster, find_non_floaters
 from drgs.gaussians.parameters import Gaussians
 
@@ -105,7 +104,7 @@ def test_a_faint_gaussian_alone_is_a_floater_and_an_opaque_one_is_not():
     assert find_non_floaters(g, rule).tolist() == [True, True, False, True]
     assert find_cluster(g, rule).tolist() == [True, True, False, False]
     assert find_cluster(g, rule, np.array([9.0, 1, 0])).tolist() == [False, False, False, True]
-    assert find_cluster(take(g, [0, 1]), replace(rule, opacity=0.999)).tolist() == [False, False]
+    assert find_cluster(g[[0, 1]], replace(rule, opacity=0.999)).tolist() == [False, False]
 
 
 @pytest.mark.parametrize("name", ["log_scales", "quats", "logit_opacities"])
@@ -115,7 +114,7 @@ def test_gaussians_that_are_not_finite_fill_no_voxel(name):
     values[3] = np.nan
     rule, rest = RULES[1], np.delete(np.arange(20), 3)
     found = find_non_floaters(replace(g, **{name: values}), rule)
-    np.testing.assert_array_equal(found[rest], find_non_floaters(take(g, rest), rule))
+    np.testing.assert_array_equal(found[rest], find_non_floaters(g[rest], rule))
 
 
 def test_default_sizes_follow_the_scene():

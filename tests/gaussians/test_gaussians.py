@@ -1,12 +1,14 @@
 """Gaussians from arrays, on the device, and some of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from drjit.llvm.ad import TensorXf
 from support.formats import gaussians_within_ranges
 from support.helpers import both_precisions
 
 import drgs
-from drgs.export.merging import take
 from drgs.gaussians.parameters import PARAMETER_NAMES
 
 COUNT = 7
@@ -68,7 +70,28 @@ def test_invalid_gaussians_are_refused(changes, message):
 
 def test_rows_are_taken_from_every_parameter():
     g, rows = gaussians_within_ranges(9), np.array([7, 0])
-    found = take(g, rows)
+    found = g[rows]
     for name in PARAMETER_NAMES:
         np.testing.assert_array_equal(getattr(found, name), getattr(g, name)[rows])
     assert found.features is None and found.smoothing is None
+    for other in (g[[7, 0]], g[-2::-7], drgs.Gaussians.concatenate([g[7], g[0]])):
+        for name in PARAMETER_NAMES:
+            np.testing.assert_array_equal(getattr(other, name), getattr(found, name))
+    assert len(g) == 9 and len(g[g.means[:, 0] > np.inf]) == 0
+    with pytest.raises(IndexError):
+        g[9]
+
+
+def test_concatenated_gaussians_stay_where_they_are():
+    """Of another origin, with fewer harmonics, on the device; what one part lacks is left out."""
+    labels = {"labels": np.ones((5, 2), np.float32)}
+    first = replace(gaussians_within_ranges(5), origin=(100.0, 0, -7), features=labels)
+    second = replace(gaussians_within_ranges(4, degree=1), features={"labels": np.zeros((4, 2))})
+    whole = drgs.Gaussians.concatenate([first, second.to(TensorXf)])
+    assert whole.origin == first.origin and len(whole) == 9
+    world = np.concatenate([first.means + np.array(first.origin), second.means])
+    np.testing.assert_allclose(whole.means + np.array(whole.origin), world, atol=1e-4)
+    np.testing.assert_array_equal(whole.features["labels"].sum(axis=1), [2] * 5 + [0] * 4)
+    np.testing.assert_array_equal(whole.shN[5:, :3], second.shN)
+    assert not whole.shN[5:, 3:].any() and whole.shN.shape == (9, 15, 3)
+    assert drgs.Gaussians.concatenate([first, replace(second, features=None)]).features is None
