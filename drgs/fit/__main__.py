@@ -77,6 +77,14 @@ def add_arguments(parser: CommandParser) -> None:
         metavar="TIME",
         help="90s, 5m, 1h30m: plan a fit that ends within this time, results included",
     )
+    parser.add_argument(
+        "--max-gaussians",
+        dest="overrides",
+        action="append",
+        type="densify.max_gaussians={}".format,
+        metavar="N",
+        help="most Gaussians at any time (densify.max_gaussians); --budget is a time",
+    )
     group = parser.add_argument_group("viewing", "These do not change the result.")
     group.add_argument(
         "--view",

@@ -27,9 +27,11 @@ from support.small_capture import write_dataset
 from support.small_fits import config_of, make_trainer, plain_dataset, steps, true_blobs
 from support.viewer_rendering import VIEWER_RENDERING
 
+from drgs.cli.commands import CommandParser
 from drgs.config.changes import with_changes
 from drgs.core.errors import UserNote
 from drgs.fit import budget
+from drgs.fit.__main__ import add_arguments
 from drgs.fit.report import Seconds
 from drgs.fit.viewers_fit import TIME_SHARE
 from drgs.gaussians.parameters import Gaussians
@@ -256,6 +258,13 @@ def test_fit_without_a_report_writes_everything_else(tmp_path):
         assert first == second, name
     measured = [any(row["test_psnr"] for row in rows) for rows in histories]
     assert measured == [True, False]
+
+
+def test_most_gaussians_are_a_setting():
+    parser = CommandParser(prog="drgs fit")
+    add_arguments(parser)
+    args = parser.parse_args(["a.yml", "--max-gaussians", "50", "--set", "iterations=9"])
+    assert args.overrides == ["densify.max_gaussians=50", "iterations=9"]
 
 
 def test_photographs_that_are_left_out_are_not_fitted(tmp_path, monkeypatch):
