@@ -356,8 +356,9 @@ def train(
     config: the path of a YAML file, or of a dataset's folder (``drgs.datasets.folders`` chooses the
     configuration, and :func:`drgs.examine` the effects if the folder is all that is given); nested
     mappings, or a :class:`drgs.config.schema.FitConfig`. dataset: the photographs and their
-    background, by default those of the section ``data``. callback: called after each iteration with
-    its :class:`drgs.training.trainer.StepReport`; the fit ends early where it returns True.
+    background, by default those of the section ``data``, which mappings then do not need.
+    callback: called after each iteration with its :class:`drgs.training.trainer.StepReport`; the
+    fit ends early where it returns True.
 
     strategy: changes the population, instead of ``densify.strategy``; effects: take part in the fit
     besides those of the configuration; loss: of an image and its photograph, instead of ``loss``;
@@ -376,6 +377,8 @@ def train(
         is_folder = Path(config).is_dir()
         config = config_for(Path(config))[0] if is_folder else load_config(config)
     elif not isinstance(config, FitConfig):
+        if dataset is not None and isinstance(data := config.get("data", {}), Mapping):
+            config = {**config, "data": {"path": ".", **data}}
         config = config_from(config, "train(): config")
     is_examined = is_folder and dataset is None and not parts
     session = FitSession(config, dataset, parts=parts, examines=is_examined)

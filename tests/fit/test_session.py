@@ -136,6 +136,13 @@ def test_callback_receives_each_iteration_and_may_end_the_fit(folder):
     assert result.trainer.iteration == 5
 
 
+def test_configuration_of_a_dataset_in_memory_names_no_data(folder):
+    rest = {key: value for key, value in CONFIG.items() if key != "data"}
+    without = drgs.train(rest, drgs.load_dataset("data"), lambda report: report.iteration == 2)
+    given = drgs.train(CONFIG, drgs.load_dataset("data"), lambda report: report.iteration == 2)
+    np.testing.assert_array_equal(without.gaussians.means, given.gaussians.means)
+
+
 def test_folder_is_fitted_with_the_settings_of_its_data(folder):
     config = drgs.train("data", callback=lambda report: True).trainer.config
     assert config.data.path == folder / "data" and config.iterations == 3000
