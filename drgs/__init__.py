@@ -8,7 +8,8 @@
 
 :class:`Gaussians` is a scene, :func:`load_dataset` reads photographs with their cameras,
 :func:`examine` tells which effects they call for, :func:`train` fits Gaussians to them, and
-:func:`rasterization` renders differentiably. :data:`EXAMPLE` is the file of a fitted crane truck.
+:func:`rasterization` renders differentiably. :func:`sensor_from_view` and :func:`view_from_sensor`
+turn cameras into Mitsuba's, and back. :data:`EXAMPLE` is the file of a fitted crane truck.
 
 Importing ``drgs`` selects the LLVM that Dr.Jit will load, registers the plugins ``splats``,
 ``splatpath``, ``calibrated`` and ``splats_minimal`` with each Mitsuba variant that is active or
@@ -32,13 +33,15 @@ if TYPE_CHECKING:
     from drgs.fit.session import train
     from drgs.gaussians.parameters import Gaussians
     from drgs.gsplat_api import rasterization
+    from drgs.integrator.scene import sensor_from_view, view_from_sensor
 
 __version__ = "0.1.0"
 
 EXAMPLE = Path(__file__).with_name("brick_crane.compressed.ply")
 """File of a fitted crane truck, for a first look: ``drgs.Gaussians.load(drgs.EXAMPLE)``."""
 
-__all__ = ["EXAMPLE", "Gaussians", "examine", "load_dataset", "rasterization", "train"]
+__all__ = ["EXAMPLE", "Gaussians", "examine", "load_dataset", "rasterization", "sensor_from_view"]
+__all__ += ["train", "view_from_sensor"]
 
 # Dr.Jit loads its libLLVM while it is being imported: this comes before anything that does.
 llvm.select_newest_llvm()
@@ -51,7 +54,9 @@ _MODULES = {
     "examine": "drgs.examine.examination",
     "load_dataset": "drgs.datasets",
     "rasterization": "drgs.gsplat_api",
+    "sensor_from_view": "drgs.integrator.scene",
     "train": "drgs.fit.session",
+    "view_from_sensor": "drgs.integrator.scene",
 }
 
 

@@ -11,11 +11,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from drgs.cameras.lens import PINHOLE
 from drgs.cameras.viewpoints import OPENCV_TO_MITSUBA, Viewpoint
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserError
 from drgs.core.memory import too_large_reason
 from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.sensors import camera_from_sensor, read_sensor
 
 NEAR_CLIP = 1e-9  # scene units: the smallest near plane, so that the integrator's applies
 SQUARE_PIXEL_TOLERANCE = 0.01  # px: largest shift at the border from treating pixels as square
@@ -60,6 +62,30 @@ def check_sizes(views: Iterable[Viewpoint], remedy: str) -> None:
         samples = 1 if motion is None or motion.shutter != "global" else motion.samples
         if reason := too_large_reason(view.width, view.height, samples=samples):
             raise UserError(f"view {view.name}: {reason}; {remedy}")
+
+
+def sensor_from_view(view: Viewpoint) -> mi.Sensor:
+    """Return a sensor that renders the image of a dataset's view: see :func:`make_sensors`."""
+    return make_sensors([view])[0]
+
+
+def view_from_sensor(sensor: mi.Sensor, name: str = "sensor") -> Viewpoint:
+    """Return the camera of a ``perspective`` sensor, or of a ``calibrated`` pinhole that stands.
+
+    The image is that of the crop window. Raises ``drgs.core.errors.UserError`` (a ValueError) for
+    other sensors. Nothing is differentiated.
+    """
+    camera = camera_from_sensor(read_sensor(sensor, NEAR_CLIP))
+    if camera.lens != PINHOLE or camera.aperture is not None or camera.shutter is not None:
+        raise UserError(
+            "view_from_sensor(): the sensor must be a pinhole that does not move, got "
+            f"{sensor.class_name()} '{sensor.id()}' with another lens, an aperture or a shutter"
+        )
+    pose = np.eye(4)
+    pose[:3, :3] = np.array(camera.rotation, np.float64).reshape(3, 3).T
+    pose[:3, 3] = np.array(camera.center).ravel()
+    fx, fy, cx, cy = (each[0] for each in (*camera.focal, *camera.principal))
+    return Viewpoint(name, pose, fx, fy, cx, cy, camera.width, camera.height)
 
 
 def make_sensors(views: Iterable[Viewpoint], calibrated: bool = False) -> list[mi.Sensor]:

@@ -7,7 +7,10 @@ from conftest import REPOSITORY
 
 import drgs
 
-PUBLIC = {"Gaussians", "examine", "load_dataset", "rasterization", "train"}
+PUBLIC = {"Gaussians", "examine", "load_dataset", "rasterization", "train"} | {
+    "sensor_from_view",
+    "view_from_sensor",
+}
 
 CALLABLE_PACKAGE = "examine"  # drgs.examine is the function, in every order of imports
 

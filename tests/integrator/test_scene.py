@@ -13,6 +13,7 @@ from support.viewer_rendering import VIEWER_RENDERING
 from support.views import View as Perspective
 from support.views import image_of, pose, splats_before
 
+import drgs
 from drgs.bench.scenes import bench_gaussians
 from drgs.cameras.camera import cameras_in_time
 from drgs.cameras.fisheye import Fisheye
@@ -22,6 +23,7 @@ from drgs.cameras.thin_prism_fisheye import ThinPrismFisheye
 from drgs.cameras.viewpoints import CameraMotion
 from drgs.config.approximations import Approximations
 from drgs.config.schema import DataConfig, ModelConfig
+from drgs.core.errors import UserError
 from drgs.datasets.types import View
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import SQUARE_PIXEL_TOLERANCE, make_scene, make_sensors, render_views
@@ -148,3 +150,38 @@ def test_approximations_reach_the_integrator():
     assert set(values) == {field.name for field in fields(Approximations)}
     scene = make_scene(bench_gaussians(5), ModelConfig(**values), (1.0, 1.0, 1.0))
     assert scene.integrator().state.approximations == Approximations(**values)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"fov_axis": "y", "principal_point_offset_x": 0.1, "principal_point_offset_y": -0.2},
+        {"film": {"crop_offset_x": 5, "crop_offset_y": 3, "crop_width": 20, "crop_height": 10}},
+    ],
+)
+def test_view_of_a_sensor_sees_along_its_rays(changes):
+    """Also the sensor of that view, by Mitsuba's own rays."""
+    film = {"type": "hdrfilm", "width": 40, "height": 24, **changes.get("film", {})}
+    pose = mi.ScalarTransform4f().look_at([3, -2, 1], [0.2, 0.1, 0], [0, 0, 1])
+    sensor = {"type": "perspective", "fov": 35, "to_world": pose, **changes, "film": film}
+    sensor = mi.load_dict(sensor)
+    view = drgs.view_from_sensor(sensor, "a")
+    assert (view.name, view.width, view.height) == ("a", *sensor.film().crop_size())
+    size = np.array([view.width, view.height])
+    for pixel in np.array([[0.5, 0.5], [3.2, 9.0], [18.0, 1.5]]):
+        there = mi.Point2f((pixel / size).tolist())
+        expected = view.camera_to_world[:3, :3] @ np.linalg.inv(view.K) @ [*pixel, 1]
+        expected /= np.linalg.norm(expected)
+        for each in (sensor, drgs.sensor_from_view(view)):
+            ray, _ = each.sample_ray(0.0, 0.5, there, mi.Point2f(0.5))
+            np.testing.assert_allclose(np.ravel(ray.d), expected, atol=1e-6)
+            origin = np.ravel(ray.o) - np.ravel(ray.d) * (np.ravel(ray.o) - view.center).dot(ray.d)
+            np.testing.assert_allclose(origin, view.center, atol=1e-5)
+
+
+def test_sensors_that_are_no_pinholes_have_no_view():
+    lens = {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2.0}
+    for sensor in (lens, {"type": "orthographic"}):
+        with pytest.raises(UserError, match=r"view_from_sensor\(\): the sensor must be a pinhole"):
+            drgs.view_from_sensor(mi.load_dict(sensor))
