@@ -83,7 +83,7 @@ def test_rows_are_taken_from_every_parameter():
 
 
 def test_concatenated_gaussians_stay_where_they_are():
-    """Of another origin, with fewer harmonics, on the device; what one part lacks is left out."""
+    """Parts of another origin, with fewer harmonics, on the device; what one lacks is left out."""
     labels = {"labels": np.ones((5, 2), np.float32)}
     first = replace(gaussians_within_ranges(5), origin=(100.0, 0, -7), features=labels)
     second = replace(gaussians_within_ranges(4, degree=1), features={"labels": np.zeros((4, 2))})
