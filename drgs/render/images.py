@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 
 import numpy as np
 
@@ -24,10 +25,12 @@ from drgs.datasets.camera_file import read_viewpoints
 from drgs.effects.cameras import CAMERAS, CamerasConfig
 from drgs.io.images import check_animation, write_animation
 from drgs.results.folder import METRICS, ORBIT
-from drgs.results.metrics import mean_of, psnr, ssim
+from drgs.results.metrics import flip, psnr, ssim
 from drgs.results.model import ImageFolder, Model
 from drgs.results.model_arguments import UP
 from drgs.results.refined_cameras import training_cameras
+
+FLIP = "flip_evaluator"  # a module that measures FLIP, where it is installed
 
 DEFAULT_SIZE, PANORAMA_SIZE = (400, 400), (800, 400)
 """Width and height, px, where nothing else decides how large an image is."""
@@ -54,19 +57,21 @@ def render_split(model: Model, split: str, folder: ImageFolder) -> None:
     views = dataset.train if split == "train" else dataset.test
     column = max(len("view"), *(len(view.name) for view in views))
     images = model.images(views, folder, [METRICS], "give --set data.image_size=...")
-    print(f"{'view':{column}}  PSNR [dB]    SSIM")
+    measures = {"psnr": psnr, "ssim": ssim, **({"flip": flip} if find_spec(FLIP) else {})}
+    titles = "".join(f"    {name.upper()}" for name in measures if name != "psnr")
+    print(f"{'view':{column}}  PSNR [dB]{titles}")
     scores: dict[str, dict[str, float]] = {}
     for view, image in zip(views, images, strict=True):
         folder.write_png(f"{view.name}.png", image)
         pair = image, view.image, view.mask
-        score = scores[view.name] = {"psnr": psnr(*pair), "ssim": ssim(*pair)}
+        score = scores[view.name] = {k: measure(*pair) for k, measure in measures.items()}
         print(f"{view.name:{column}}  {_line(**score)}", flush=True)
-    quality = mean_of([(score["psnr"], score["ssim"]) for score in scores.values()])
-    mean = {"psnr": quality.psnr, "ssim": quality.ssim}
+    rows = list(scores.values())
+    mean = {name: float(np.mean([row[name] for row in rows])) for name in measures}
     print(f"{'mean':{column}}  {_line(**mean)}")
     report = {
         "split": dataset.test_split if split == "test" else "train",
-        "num_views": quality.num_views,
+        "num_views": len(rows),
         "num_gaussians": model.gaussians.num_gaussians,
         "mean": mean,
         "views": scores,
@@ -136,8 +141,8 @@ def viewpoints_of(args: argparse.Namespace, model: Model) -> list[Viewpoint]:
     return [view.with_offset(-np.array(origin)) for view in views]
 
 
-def _line(psnr: float, ssim: float) -> str:
-    return f"{psnr:9.2f}  {ssim:.4f}"
+def _line(psnr: float, **others: float) -> str:
+    return f"{psnr:9.2f}" + "".join(f"  {value:.4f}" for value in others.values())
 
 
 def _replace_infinities(value: object) -> object:

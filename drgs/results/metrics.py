@@ -5,6 +5,7 @@ Shares no code with ``drgs.training.losses``: one checks the other. Not differen
 
 from __future__ import annotations
 
+import importlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -83,6 +84,18 @@ def ssim(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> 
     channels = zip(np.moveaxis(x, 2, 0), np.moveaxis(y, 2, 0), strict=True)
     # One channel at a time: temporaries take memory.
     return float(np.mean([_mean(_ssim_map(*channel, mask), mask) for channel in channels]))
+
+
+def flip(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> float:
+    """Return the mean of FLIP, the difference that is seen when images alternate: 0 to 1.
+
+    Arguments as of :func:`psnr`; pixels that do not count still are surroundings of others. By
+    ``flip-evaluator`` (Andersson et al. 2020), at 67 pixels per degree.
+    """
+    evaluate = importlib.import_module("flip_evaluator").evaluate
+    x, y = (np.asarray(each, np.float32) for each in _prepare("flip()", image, target))
+    differences = evaluate(y, x, "LDR", applyMagma=False, computeMeanError=False)[0]
+    return _mean(differences[:, :, 0], mask)
 
 
 def _ssim_map(x: np.ndarray, y: np.ndarray, mask: ArrayLike | None) -> np.ndarray:

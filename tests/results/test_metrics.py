@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drgs.results.metrics import mean_quality, psnr, ssim
+from drgs.results.metrics import flip, mean_quality, psnr, ssim
 
 
 def images(seed=0, shape=(17, 14, 3)):
@@ -75,3 +75,30 @@ def test_wrong_input_is_refused():
         ssim(X[..., 0], Y[..., 0])
     with pytest.raises(ValueError, match="at least one view"):
         mean_quality([])
+
+
+def lab_of(linear):
+    """L*a*b* of linear sRGB (3,), D65, with the chroma of Hunt's effect."""
+    matrix = [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750]]
+    matrix = np.array([*matrix, [0.0193339, 0.1191920, 0.9503041]])
+    ratio = matrix @ linear / matrix.sum(axis=1)
+    x, y, z = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio * 841 / 108 + 4 / 29)
+    lightness = 116 * y - 16
+    return np.array([lightness, 5 * (x - y) * lightness, 2 * (y - z) * lightness])
+
+
+@pytest.mark.parametrize(("first", "second"), [(0.5, 0.55), (0.1, 0.9), (0.3, 0.3)])
+def test_flip_of_plain_grey_images_is_that_of_their_lightness(first, second):
+    """Andersson et al. 2020, sections 4.1.3 and 4.3; where the mask is 0, the images differ."""
+    pytest.importorskip("flip_evaluator")
+    linear = [((v + 0.055) / 1.055) ** 2.4 for v in (first, second)]
+    difference = np.abs(np.subtract(*(lab_of(np.full(3, v))[0] for v in linear))) ** 0.7
+    green, blue = lab_of(np.array([0, 1, 0])), lab_of(np.array([0, 0, 1]))
+    most = (abs(green[0] - blue[0]) + np.hypot(*(green - blue)[1:])) ** 0.7
+    share = difference / most
+    expected = share * 0.95 / 0.4 if share < 0.4 else 0.95 + (share - 0.4) / 0.6 * 0.05
+    image, target = np.full((30, 90, 3), first), np.full((30, 90, 3), second)
+    assert flip(image, target) == pytest.approx(expected, abs=1e-4)
+    mask = np.ones((30, 90))
+    image[:, :10], mask[:, :40] = 1, 0
+    assert flip(image, target, mask) == pytest.approx(expected, abs=1e-4)
