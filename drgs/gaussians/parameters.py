@@ -197,9 +197,10 @@ class Gaussians(Generic[Tensor]):
 
         rows: a mask (N,), indices, a slice or a number.
         """
-        host, rows = self.numpy(), np.atleast_1d(np.arange(self.num_gaussians)[rows])
-        some = Gaussians.from_arrays({name: array[rows] for name, array in host.arrays.items()})
-        return replace(some, rendered_with=self.rendered_with, origin=self.origin)
+        rows = np.atleast_1d(np.arange(self.num_gaussians)[rows])
+        some = {name: np.asarray(array)[rows] for name, array in self.arrays.items()}
+        chosen = Gaussians.from_arrays(some)
+        return replace(chosen, rendered_with=self.rendered_with, origin=self.origin)
 
     @property
     def num_gaussians(self) -> int:

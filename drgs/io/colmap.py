@@ -187,7 +187,7 @@ def _images(
         _check_numbers(place, ("TX", "TY", "TZ"), pose[4:])
         if camera not in cameras:
             raise UserError(f"{place}: the number of a camera was expected, got {camera}")
-        rotation = Rotation.from_quat(pose[:4], scalar_first=True).inv()
+        rotation = Rotation.from_quat([*pose[1:4], pose[0]]).inv()
         camera_to_world = np.eye(4)
         camera_to_world[:3, :3] = rotation.as_matrix()
         camera_to_world[:3, 3] = -rotation.apply(pose[4:])

@@ -90,6 +90,7 @@ def test_concatenated_gaussians_stay_where_they_are():
     whole = drgs.Gaussians.concatenate([first, second.to(TensorXf)])
     assert whole.origin == first.origin and len(whole) == 9
     world = np.concatenate([first.means + np.array(first.origin), second.means])
+    # float32 at 100 from the origin.
     np.testing.assert_allclose(whole.means + np.array(whole.origin), world, atol=1e-4)
     np.testing.assert_array_equal(whole.features["labels"].sum(axis=1), [2] * 5 + [0] * 4)
     np.testing.assert_array_equal(whole.shN[5:, :3], second.shN)

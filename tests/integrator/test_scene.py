@@ -175,6 +175,7 @@ def test_view_of_a_sensor_sees_along_its_rays(changes):
         expected /= np.linalg.norm(expected)
         for each in (sensor, drgs.sensor_from_view(view)):
             ray, _ = each.sample_ray(0.0, 0.5, there, mi.Point2f(0.5))
+            # float32: unit vectors, and points that are 4 from the origin.
             np.testing.assert_allclose(np.ravel(ray.d), expected, atol=1e-6)
             origin = np.ravel(ray.o) - np.ravel(ray.d) * (np.ravel(ray.o) - view.center).dot(ray.d)
             np.testing.assert_allclose(origin, view.center, atol=1e-5)

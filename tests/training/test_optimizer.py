@@ -73,6 +73,7 @@ def test_steps_are_along_nesterov_s_momentum():
         ahead = (0.9 * first + 0.1 * gradient) / (1 - 0.9 ** (seed + 2))
         value -= RATES["log_scales"] * ahead / np.sqrt(second / (1 - 0.999 ** (seed + 1)))
         found, moment, _ = snapshot(optimizer)["log_scales"]
+        # float32: values of about 1, and moments of about 0.3, after five steps.
         np.testing.assert_allclose(found, value, atol=2e-6)
         np.testing.assert_allclose(moment, first, atol=1e-6)
 
