@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -131,3 +132,17 @@ def test_statistics_are_printed_at_their_place_as_text_or_json(model):
     assert first["properties"]["x"]["greatest"] == pytest.approx(g.means[:, 0].max())
     text = assert_ends_well(export.main, model, "--info").stdout
     assert "gaussians: 80\n" in text and len(text.splitlines()) == 6 + len(PROPERTIES)
+
+
+def test_training_cameras_see_the_moved_model_as_before():
+    """Rotated, scaled and moved far away: each mean stays at its pixel."""
+    g, view = blobs(20), make_dataset(train=1, test=1).train[0]
+    source = ExportSource(g, Path("a.ply"), cameras=[view])
+    turn = Rotation.from_euler("xyz", [20, -40, 70], degrees=True).as_matrix()
+    moved = source.move(turn, 2.5).translate([1e5, -3, 7])
+    pixels = []
+    for camera, means in ((view, g.means), (moved.cameras[0], moved.gaussians.means)):
+        x, y, z = camera.K @ (camera.viewmat[:3, :3] @ means.T + camera.viewmat[:3, 3:])
+        pixels.append([x / z, y / z])
+    # float32 positions, a few units before the camera: pixels to 1e-5 of some 30.
+    np.testing.assert_allclose(pixels[1], pixels[0], rtol=0, atol=1e-3)
