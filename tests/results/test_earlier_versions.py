@@ -29,7 +29,7 @@ ROUNDING = 1e-4
 
 @pytest.mark.slow
 def test_a_checkpoint_is_continued(tmp_path, monkeypatch):
-    """That version's steps were Adam's own."""
+    """Steps of that version were Adam's own."""
     monkeypatch.setattr(adam, "NesterovAdam", adam.LeanAdam)
     out, data = tmp_path / "out", tmp_path / "data"
     out.mkdir()
