@@ -26,7 +26,7 @@ from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene
 from drgs.io.figures import new_figure, write_figure
 from drgs.reference import splatting as reference
-from drgs.results.folder import GAUSSIANS
+from drgs.results.folder import own_gaussians
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,13 +49,13 @@ class Timing:
 
 def add_arguments(parser: CommandParser) -> None:
     """Add the arguments of the command."""
-    parser.show_examples("%(prog)s --trained out/lego/point_cloud.ply")
+    parser.show_examples("%(prog)s --trained out/lego/point_cloud_drgs.ply")
     add_out(parser, run, "speed.csv", "speed.png")
     parser.add_argument("--quick", action="store_true", help="10,000 Gaussians only; two minutes")
     text = "compile for AVX2; only where Dr.Jit uses AVX-512"
     parser.add_argument("--without-avx512", action="store_true", help=text)
-    text = "also measure this fitted scene (default: out/lego/point_cloud.ply, if it exists)"
-    path = Path("out/lego") / GAUSSIANS
+    text = "also measure this fitted scene (default: that of out/lego, if it exists)"
+    path = own_gaussians(Path("out/lego"))
     parser.add_argument("--trained", type=Path, default=path, metavar="PLY", help=text)
 
 

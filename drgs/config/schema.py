@@ -292,7 +292,7 @@ class OutputConfig(Section):
     """Output folder, relative to the configuration file; null: out/NAME in the current folder, with
     the NAME of the configuration file."""
     bake_smoothing: bool = False
-    """Bake model.smoothing into point_cloud.ply."""
+    """Bake model.smoothing into the fit's own Gaussians as well."""
     save_renders: bool = True
     """Write renders/<split>/*.png."""
     report: bool = True

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from drgs.datasets.types import Dataset, View
     from drgs.training.views import FitState, TrainingView
 
-CAMERAS = "cameras.json"  # refined cameras of the training views
+REFINED_CAMERAS = "refined_cameras.json"  # refined cameras of the training views
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
@@ -124,7 +124,7 @@ class CameraRefinement(OptimisedEffect):
 
     order = 60  # places the sensor that is rendered, with derivatives
     moves_sensors = True
-    files = (CAMERAS,)
+    files = (REFINED_CAMERAS,)
 
     @classmethod
     @override
@@ -289,9 +289,9 @@ class CameraRefinement(OptimisedEffect):
 
     @override
     def write(self, folder: Path, dataset: Dataset) -> None:
-        """Write ``cameras.json``: the refined training cameras, as ``transforms.json`` has them."""
+        """Write the refined training cameras, in the layout of ``transforms.json``."""
         cameras = cameras_json(self.refined_views(dataset.train), dataset.origin)
-        write_json(folder / CAMERAS, {"lens_change": asdict(self.lens_change), **cameras})
+        write_json(folder / REFINED_CAMERAS, {"lens_change": asdict(self.lens_change), **cameras})
 
 
 def _middle(values: Sequence[float]) -> float:

@@ -19,7 +19,7 @@ from drgs.effects.smoothing import bake_smoothing
 from drgs.export.merging import world_means
 from drgs.gaussians.parameters import Gaussians
 from drgs.gaussians.similarity import Similarity, shortest_rotation
-from drgs.results.folder import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, load_run_config, require_results
+from drgs.results import folder
 from drgs.results.refined_cameras import training_cameras
 
 Z_UP = np.array([0.0, 0.0, 1.0])  # of datasets, and of Gaussians that formats with axes encode
@@ -118,22 +118,23 @@ def load_source(what: Path, honoured: Honoured | None = None) -> ExportSource:
         raise UserError(f"{what}: there is no such file or folder")
     path, config = what, None
     if what.is_dir():
-        for_viewers = what / GAUSSIANS_FOR_VIEWERS
-        require_results(what, *(() if for_viewers.is_file() else (GAUSSIANS,)))
-        config, path = load_run_config(what), what / GAUSSIANS
+        own, path = folder.own_gaussians(what), folder.viewer_gaussians(what)
+        folder.require_results(what, (path if path.is_file() else own).name)
+        config = folder.load_run_config(what)
         fitted = config.model.approximations
         is_enough = honoured is not None and fitted.non_default.keys() <= honoured(fitted)
-        if for_viewers.is_file() and not (is_enough and path.is_file()):
-            path = for_viewers
+        if own.is_file() and (is_enough or not path.is_file()):
+            path = own
     gaussians = Gaussians.load(path)
     recorded = from_ply_header(str(path), gaussians.rendered_with or {})
     others = {name: value for name, value in recorded.items() if value != DECLARED[name].default}
     shown = frozenset() if honoured is None else honoured(Approximations.from_values(recorded))
     if unknown := [f"{k} {str(v).lower()}" for k, v in others.items() if k not in shown]:
-        beside = path.with_name(GAUSSIANS_FOR_VIEWERS)
+        beside = folder.viewer_gaussians(path.parent)
+        is_better = beside.is_file() and beside != path == folder.own_gaussians(path.parent)
         note_user(
             f"{path}: made to be rendered with {', '.join(unknown)}; programs that do not will "
-            "show it otherwise" + (f"; export {beside} instead" if beside.is_file() else "")
+            "show it otherwise" + (f"; export {beside} instead" if is_better else "")
         )
     gaussians = bake_smoothing(replace(gaussians, rendered_with=others or None))
     if config is None:

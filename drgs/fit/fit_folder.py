@@ -23,6 +23,7 @@ from drgs.core.errors import UserError
 from drgs.core.files import atomic_path, write_json
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
+from drgs.effects.cameras import CamerasConfig
 from drgs.effects.smoothing import bake_smoothing
 from drgs.fit.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.fit.inputs import versions
@@ -34,7 +35,7 @@ from drgs.results import folder
 from drgs.results.history import HistoryRow, write_density, write_history
 from drgs.results.html_viewer import DisplaySettings, shows_as_fitted
 from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
-from drgs.results.refined_cameras import write_views
+from drgs.results.refined_cameras import refined_dataset, write_pinholes, write_views
 from drgs.training.trainer import Trainer
 
 
@@ -87,7 +88,7 @@ class FitFolder:
             return config
         start = {"start": "auto", "point_cloud": None, "half_extent": None}
         start |= {"max_point_error": None, "min_track_length": None}
-        start["gaussians"] = self.path / folder.GAUSSIANS
+        start["gaussians"] = folder.own_gaussians(self.path)
         return with_changes(config, {f"init.{name}": value for name, value in start.items()})
 
     def checkpoint_for(self, config: FitConfig, has_budget: bool) -> Checkpoint | None:
@@ -162,9 +163,13 @@ class FitFolder:
         out, config, dataset, render = self.path, trainer.config, trainer.dataset, trainer.images
         with suppress(OSError):  # of a fit that goes on: no longer true
             (out / folder.METRICS).unlink()
-        saved_gaussians(gaussians, config).save(out / folder.GAUSSIANS)
+        own, other = saved_gaussians(gaussians, config), for_viewers and for_viewers.gaussians
+        write_gaussians(out, own, bake_smoothing(own) if other is None else other)
         for effect in trainer.effects:
             effect.write(out, dataset)
+        is_refined = config.section("cameras", CamerasConfig).optimise
+        views = refined_dataset(dataset, out).train if is_refined else dataset.train
+        write_pinholes(out / folder.CAMERAS, views)
         write_history(out / folder.HISTORY, history.rows)
         write_density(out / folder.DENSITY, history.density)
         write_views(out / folder.VIEWS, dataset)
@@ -173,10 +178,8 @@ class FitFolder:
         scores = write_images(out, dataset, render, output.save_renders, output.report)
         test = SplitMetrics(**vars(mean_of(scores)), split=split)
         metrics = self._metrics(config, gaussians.num_gaussians, wall_s, test)
-        other, approximations = None, config.model.approximations
+        approximations = config.model.approximations
         if for_viewers is not None:
-            other = for_viewers.gaussians
-            other.save(out / folder.GAUSSIANS_FOR_VIEWERS)
             views = evenly_spaced(dataset.test, MAX_PICTURES)
             images = zip(for_viewers.images(views), views, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
@@ -228,7 +231,7 @@ class FitFolder:
             f"{metrics['iterations']} iterations in {metrics['wall_s']:.0f} s"
         ]
         if viewers is not None:
-            path = self.path / folder.GAUSSIANS_FOR_VIEWERS
+            path = self.path / folder.GAUSSIANS
             lines.append(f"as other viewers show {path}: PSNR {viewers['psnr']:.2f} dB")
         lines.append(f"written: {self.path}")
         if cast("dict[str, object]", metrics["config"]["output"])["report"]:
@@ -244,10 +247,23 @@ class FitFolder:
 
 
 def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
-    """Return the Gaussians of ``point_cloud.ply`` from the trainer's.
+    """Return the fit's own Gaussians, as they are saved, from the trainer's.
 
-    Its header records approximations that are not the default. It has no smoothing filter with
+    Their header records approximations that are not the default. They have no smoothing filter with
     ``output.bake_smoothing``.
     """
     gaussians = replace(gaussians, rendered_with=config.model.approximations.non_default or None)
     return bake_smoothing(gaussians) if config.output.bake_smoothing else gaussians
+
+
+def write_gaussians(out: Path, own: Gaussians, for_viewers: Gaussians) -> None:
+    """Write the fit's own Gaussians, in a second file if those for viewers differ.
+
+    The order of writing and removing keeps either file of its kind at every moment.
+    """
+    differ = own.rendered_with is not None or own.smoothing is not None
+    if differ:
+        own.save(out / folder.OWN_GAUSSIANS)
+    for_viewers.save(out / folder.GAUSSIANS)
+    for name in (folder.EARLIER_FOR_VIEWERS, *(() if differ else (folder.OWN_GAUSSIANS,))):
+        (out / name).unlink(missing_ok=True)

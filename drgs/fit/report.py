@@ -35,8 +35,8 @@ from drgs.io.images import encode, to_uint8, write_animation, write_png
 from drgs.results.folder import (
     CURVES,
     GAUSSIANS,
-    GAUSSIANS_FOR_VIEWERS,
     ORBIT,
+    OWN_GAUSSIANS,
     RENDERS,
     REPORT,
     SIDE_BY_SIDE,
@@ -280,10 +280,10 @@ def _viewers(metrics: FitMetrics) -> str:
     if "viewers" not in metrics:
         return "splat viewers read it"
     shown = metrics["viewers"]
-    link = f'<a href="{GAUSSIANS_FOR_VIEWERS}" download>{GAUSSIANS_FOR_VIEWERS}</a>'
+    link = f'<a href="{OWN_GAUSSIANS}" download>{OWN_GAUSSIANS}</a>'
     return (
-        f"for drgs; for most other viewers, use {link}: they show {shown['num_views']} "
-        f"{shown['split']} views at {shown['psnr']:.2f} dB"
+        f"most splat viewers show {shown['num_views']} {shown['split']} views at "
+        f"{shown['psnr']:.2f} dB; for drgs, use {link}"
     )
 
 

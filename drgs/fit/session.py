@@ -336,7 +336,7 @@ class FitSession:
 class FitResult:
     """The result of a fit in memory."""
 
-    gaussians: Gaussians  # numpy arrays, as in the command's ``point_cloud.ply``
+    gaussians: Gaussians  # numpy arrays, as the command writes the fit's own
     history: tuple[HistoryRow, ...]  # as in ``history.csv``
     trainer: Trainer  # ``step()`` continues the fit, ``images(views)`` renders
 

@@ -1,4 +1,4 @@
-"""Gaussians for other viewers: ``point_cloud_viewers.ply``.
+"""Gaussians for other viewers: ``point_cloud.ply``, if the fit renders otherwise.
 
 Viewers render with the defaults of ``drgs.config.approximations``. A copy of Gaussians that were
 fitted with other settings is changed in closed form (``drgs.effects.smoothing``) and then fitted

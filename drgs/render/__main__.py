@@ -1,7 +1,7 @@
 """``python -m drgs.render WHAT --out DIR``: images of Gaussians, of a fit, of a Mitsuba scene.
 
 ``WHAT`` is a file of Gaussians (``drgs.io.formats``), the output folder of a fit
-(``point_cloud.ply`` and ``config.yml``) or a Mitsuba scene (``.xml``; Mitsuba's own binary cannot
+(its Gaussians and ``config.yml``) or a Mitsuba scene (``.xml``; Mitsuba's own binary cannot
 load Python plugins). Cameras of Gaussians are the photographs' (``--split``, with metrics), an
 orbit (``--orbit``), a file's (``--camera``) or one (``--origin``).
 
@@ -81,7 +81,7 @@ def add_arguments(parser: CommandParser) -> None:
         type=_definition,
         action="append",
         metavar="NAME=VALUE",
-        help="parameter of the scene file, as in model=point_cloud.ply; repeatable",
+        help="parameter of the scene file, as in model=point_cloud_drgs.ply; repeatable",
     )
     add_execution_arguments(parser, variants=None)
     parser.set_defaults(run=run, is_shared=True)

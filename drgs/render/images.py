@@ -22,13 +22,13 @@ from drgs.config.schema import FitConfig
 from drgs.core.constants import SHUTTER_SAMPLES
 from drgs.core.files import write_json
 from drgs.datasets.camera_file import read_viewpoints
-from drgs.effects.cameras import CAMERAS, CamerasConfig
+from drgs.effects.cameras import CamerasConfig
 from drgs.io.images import check_animation, write_animation
 from drgs.results.folder import METRICS, ORBIT
 from drgs.results.metrics import flip, psnr, ssim
 from drgs.results.model import ImageFolder, Model
 from drgs.results.model_arguments import UP
-from drgs.results.refined_cameras import training_cameras
+from drgs.results.refined_cameras import refined_cameras_file, training_cameras
 
 FLIP = "flip_evaluator"  # a module that measures FLIP, where it is installed
 
@@ -101,8 +101,8 @@ def _orbited_views(
 ) -> Sequence[Viewpoint]:
     """Return the training cameras: those in a fit's folder, unless photographs are named."""
     if args.what.is_dir() and (args.scene, args.data, args.set) == (None, None, None):
-        refined = args.what / CAMERAS
-        if config.section("cameras", CamerasConfig).optimise and refined.is_file():
+        refined = refined_cameras_file(args.what)
+        if config.section("cameras", CamerasConfig).optimise and refined is not None:
             print(f"cameras: as refined, from {refined}")
         if (views := training_cameras(args.what, model.gaussians.origin)) is not None:
             return views

@@ -28,8 +28,9 @@ from drgs.core.folders import FolderRecord
 
 CONFIG = "config.yml"  # every value of the configuration; marks whose folder it is
 CHECKPOINT = "checkpoint.npz"  # while the fit runs: see :mod:`drgs.fit.checkpoint`
-GAUSSIANS = "point_cloud.ply"
-GAUSSIANS_FOR_VIEWERS = "point_cloud_viewers.ply"  # for viewers without our approximations
+GAUSSIANS = "point_cloud.ply"  # as any viewer renders; in earlier versions, as the fit does
+OWN_GAUSSIANS = "point_cloud_drgs.ply"  # as the fit renders, if viewers do otherwise
+EARLIER_FOR_VIEWERS = "point_cloud_viewers.ply"  # of earlier versions
 HISTORY = "history.csv"
 DENSITY = "density.csv"  # changes of the population, if there are any
 CURVES = "curves.png"
@@ -40,6 +41,7 @@ VIEWER = "viewer.html"  # interactive page of the Gaussians, unless too large
 RENDERS = "renders"  # a folder for each split, with an image of each view
 SIDE_BY_SIDE = "side_by_side"  # the same, with the photograph and the difference beside the image
 VIEWS = "views.json"  # the dataset's cameras of the training views, for orbits
+CAMERAS = "cameras.json"  # training cameras as pinholes, in the layout of the 3DGS reference
 EXAMINATION = "examination.json"  # which effects an examination chose, with the evidence
 BUDGET_PLAN = "plan.txt"  # the plan for a budget of time, with reasons
 METRICS = "metrics.json"  # written last
@@ -52,8 +54,18 @@ def result_names() -> list[str]:
     for each in EFFECTS.all():
         names += each.value.files or [f"{each.name}.json"] * each.value.has_numbers
     names += [CHECKPOINT, CURVES, DENSITY, EXAMINATION, HISTORY, METRICS, ORBIT, ORBIT_GIF]
-    names += [BUDGET_PLAN, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, RENDERS, REPORT, SIDE_BY_SIDE]
-    return [*names, VIEWER, VIEWS]
+    names += [BUDGET_PLAN, CAMERAS, RENDERS, REPORT, SIDE_BY_SIDE, VIEWER, VIEWS]
+    return [*names, GAUSSIANS, OWN_GAUSSIANS, EARLIER_FOR_VIEWERS]
+
+
+def own_gaussians(folder: Path) -> Path:
+    """Return the file of a fit's own Gaussians, which drgs renders as the fit does."""
+    return path if (path := folder / OWN_GAUSSIANS).is_file() else folder / GAUSSIANS
+
+
+def viewer_gaussians(folder: Path) -> Path:
+    """Return the file of a fit that other viewers render correctly, if there is one."""
+    return path if (path := folder / EARLIER_FOR_VIEWERS).is_file() else folder / GAUSSIANS
 
 
 COMMAND = "fit"

@@ -24,15 +24,15 @@ from drgs.core.errors import PluginError, UserError, format_names
 from drgs.core.files import write_json
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets import Dataset, load_dataset
-from drgs.effects.cameras import CAMERAS, CamerasConfig
+from drgs.effects.cameras import CamerasConfig
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import check_lenses, check_sizes, make_scene, make_sensors, render_views
 from drgs.integrator.state import is_splats
 from drgs.integrator.summary import format_effects, summary_of_views
 from drgs.io.images import write_png
-from drgs.results.folder import CONFIG, ERROR_BUDGET, GAUSSIANS, relocate_data, require_results
-from drgs.results.refined_cameras import refined_dataset
+from drgs.results.folder import CONFIG, ERROR_BUDGET, own_gaussians, relocate_data, require_results
+from drgs.results.refined_cameras import refined_cameras_file, refined_dataset
 
 if TYPE_CHECKING:  # imported where there is an error budget
     from drgs.accuracy.error_budget import BudgetReport
@@ -207,7 +207,7 @@ class Model:
             )
         dataset = load_dataset(self.config.data_for_rendering, sections=self.config.sections)
         dataset = dataset.relative_to(self.gaussians.origin)
-        if self.path is None or not (path := self.path.parent / CAMERAS).is_file():
+        if self.path is None or (path := refined_cameras_file(self.path.parent)) is None:
             return dataset
         if not self.config.section("cameras", CamerasConfig).optimise:
             print(
@@ -232,8 +232,8 @@ def load_model(
     """
     path, config_path = what, scene
     if what.is_dir():
-        require_results(what, GAUSSIANS)
-        config_path, path = scene or what / CONFIG, what / GAUSSIANS
+        config_path, path = scene or what / CONFIG, own_gaussians(what)
+        require_results(what, path.name)
     config = None if config_path is None else load_open_config(config_path, overrides, background)
     if config is not None and what.is_dir() and scene is None:
         config = relocate_data(what, config, ("data.path",))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,14 +16,23 @@ from drgs.core.origin import Origin
 from drgs.datasets.camera_file import cameras_json, read_viewpoints
 from drgs.datasets.transforms import MAX_BYTES
 from drgs.datasets.types import Dataset, View
-from drgs.effects.cameras import CAMERAS, CamerasConfig, LensChange
-from drgs.results.folder import VIEWS, load_run_config
+from drgs.effects.cameras import REFINED_CAMERAS, CamerasConfig, LensChange
+from drgs.results.folder import CAMERAS, VIEWS, load_run_config
+
+
+def refined_cameras_file(folder: Path) -> Path | None:
+    """Return the file of refined cameras in ``folder``, or None; earlier: ``cameras.json``."""
+    if (path := folder / REFINED_CAMERAS).is_file():
+        return path
+    if not (path := folder / CAMERAS).is_file():
+        return None
+    is_list = read_text(path, "file of cameras", MAX_BYTES).lstrip().startswith("[")
+    return None if is_list else path
 
 
 def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
     """Return a dataset with the refined cameras in ``folder``, if any."""
-    path = folder / CAMERAS
-    if not path.is_file():
+    if (path := refined_cameras_file(folder)) is None:
         return dataset
     try:
         found = json.loads(read_text(path, "refined cameras", MAX_BYTES))
@@ -45,8 +55,8 @@ def refined_viewpoints(folder: Path, origin: Origin) -> list[Viewpoint] | None:
 
     origin: of their positions, world. Raises :class:`UserError` as ``read_viewpoints``.
     """
-    path = folder / CAMERAS
-    if not path.is_file() or not load_run_config(folder).section("cameras", CamerasConfig).optimise:
+    path = refined_cameras_file(folder)
+    if path is None or not load_run_config(folder).section("cameras", CamerasConfig).optimise:
         return None
     return _read_relative(path, origin)
 
@@ -74,3 +84,17 @@ def _with_pose(view: View, camera_to_world: np.ndarray) -> View:
 def write_views(path: Path, dataset: Dataset) -> None:
     """Write the dataset's cameras of the training views."""
     write_json(path, cameras_json(dataset.train, dataset.origin))
+
+
+def write_pinholes(path: Path, views: Sequence[View]) -> None:
+    """Write cameras as the 3DGS reference writes ``cameras.json``, for other programs.
+
+    Positions are those of ``point_cloud.ply``; rotations are camera to world, OpenCV axes. The
+    layout has no distortion, principal point or motion.
+    """
+    cameras = []
+    for index, view in enumerate(views):
+        camera = {"id": index, "img_name": view.name, "width": view.width, "height": view.height}
+        pose = {"position": view.center.tolist(), "rotation": view.camera_to_world[:3, :3].tolist()}
+        cameras.append({**camera, **pose, "fx": view.fx, "fy": view.fy})
+    write_json(path, cameras)
