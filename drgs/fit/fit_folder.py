@@ -23,7 +23,6 @@ from drgs.core.errors import UserError
 from drgs.core.files import atomic_path, write_json
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
-from drgs.effects.cameras import CamerasConfig
 from drgs.effects.smoothing import bake_smoothing
 from drgs.fit.checkpoint import Checkpoint, load_checkpoint, remove_checkpoint
 from drgs.fit.inputs import versions
@@ -35,7 +34,7 @@ from drgs.results import folder
 from drgs.results.history import HistoryRow, write_density, write_history
 from drgs.results.html_viewer import DisplaySettings, shows_as_fitted
 from drgs.results.metrics import FitMetrics, SplitMetrics, mean_of, mean_quality
-from drgs.results.refined_cameras import refined_dataset, write_pinholes, write_views
+from drgs.results.refined_cameras import write_pinholes, write_views
 from drgs.training.trainer import Trainer
 
 
@@ -163,32 +162,30 @@ class FitFolder:
         out, config, dataset, render = self.path, trainer.config, trainer.dataset, trainer.images
         with suppress(OSError):  # of a fit that goes on: no longer true
             (out / folder.METRICS).unlink()
-        own, other = saved_gaussians(gaussians, config), for_viewers and for_viewers.gaussians
-        write_gaussians(out, own, bake_smoothing(own) if other is None else other)
+        own = saved_gaussians(gaussians, config)
+        other = bake_smoothing(own) if for_viewers is None else for_viewers.gaussians
+        write_gaussians(out, own, other)
         for effect in trainer.effects:
             effect.write(out, dataset)
-        is_refined = config.section("cameras", CamerasConfig).optimise
-        views = refined_dataset(dataset, out).train if is_refined else dataset.train
-        write_pinholes(out / folder.CAMERAS, views)
         write_history(out / folder.HISTORY, history.rows)
         write_density(out / folder.DENSITY, history.density)
         write_views(out / folder.VIEWS, dataset)
         folder.write_run_config(out, config)
+        write_pinholes(out, dataset)
         output, split = config.output, dataset.test_split
         scores = write_images(out, dataset, render, output.save_renders, output.report)
         test = SplitMetrics(**vars(mean_of(scores)), split=split)
         metrics = self._metrics(config, gaussians.num_gaussians, wall_s, test)
-        approximations = config.model.approximations
         if for_viewers is not None:
             views = evenly_spaced(dataset.test, MAX_PICTURES)
             images = zip(for_viewers.images(views), views, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
             metrics["viewers"] = SplitMetrics(**vars(quality), split=split)
         if output.report:
-            if other is not None and not shows_as_fitted(approximations):
+            approximations = config.model.approximations
+            shown = DisplaySettings(bake_smoothing(gaussians), approximations)
+            if not shows_as_fitted(approximations):
                 shown = DisplaySettings(other, Approximations())
-            else:
-                shown = DisplaySettings(bake_smoothing(gaussians), approximations)
             scene = trainer.full_scene()
             assert scene is not None, "rank 0 writes the results"
             fitted = FitImages(scene, gaussians, render, shown)
@@ -257,10 +254,7 @@ def saved_gaussians(gaussians: Gaussians, config: FitConfig) -> Gaussians:
 
 
 def write_gaussians(out: Path, own: Gaussians, for_viewers: Gaussians) -> None:
-    """Write the fit's own Gaussians, in a second file if those for viewers differ.
-
-    The order of writing and removing keeps either file of its kind at every moment.
-    """
+    """Write a fit's Gaussians, in an order in which either file is of its kind at all times."""
     differ = own.rendered_with is not None or own.smoothing is not None
     if differ:
         own.save(out / folder.OWN_GAUSSIANS)

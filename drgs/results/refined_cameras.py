@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,8 +25,7 @@ def refined_cameras_file(folder: Path) -> Path | None:
         return path
     if not (path := folder / CAMERAS).is_file():
         return None
-    is_list = read_text(path, "file of cameras", MAX_BYTES).lstrip().startswith("[")
-    return None if is_list else path
+    return None if read_text(path, "cameras", MAX_BYTES).lstrip().startswith("[") else path
 
 
 def refined_dataset(dataset: Dataset, folder: Path) -> Dataset:
@@ -86,15 +84,14 @@ def write_views(path: Path, dataset: Dataset) -> None:
     write_json(path, cameras_json(dataset.train, dataset.origin))
 
 
-def write_pinholes(path: Path, views: Sequence[View]) -> None:
-    """Write cameras as the 3DGS reference writes ``cameras.json``, for other programs.
+def write_pinholes(folder: Path, dataset: Dataset) -> None:
+    """Write the training cameras, refined if possible, as the 3DGS reference does.
 
-    Positions are those of ``point_cloud.ply``; rotations are camera to world, OpenCV axes. The
-    layout has no distortion, principal point or motion.
+    Positions are those of ``point_cloud.ply``; distortion and principal point are left out.
     """
-    cameras = []
-    for index, view in enumerate(views):
-        camera = {"id": index, "img_name": view.name, "width": view.width, "height": view.height}
-        pose = {"position": view.center.tolist(), "rotation": view.camera_to_world[:3, :3].tolist()}
-        cameras.append({**camera, **pose, "fx": view.fx, "fy": view.fy})
-    write_json(path, cameras)
+    views, cameras = refined_viewpoints(folder, dataset.origin) or dataset.train, []
+    for view, given in zip(views, dataset.train, strict=True):
+        camera = {"id": len(cameras), "img_name": given.name, "position": view.center.tolist()}
+        camera["rotation"] = view.camera_to_world[:3, :3].tolist()
+        cameras.append(camera | {k: getattr(view, k) for k in ("width", "height", "fx", "fy")})
+    write_json(folder / CAMERAS, cameras)
