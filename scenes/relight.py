@@ -68,6 +68,7 @@ from drgs.gaussians.similarity import Similarity
 from drgs.io.figures import new_figure, write_figure
 from drgs.io.images import write_animation, write_png
 from drgs.reference import splatting as reference
+from drgs.results.folder import own_gaussians
 from scipy.spatial.transform import Rotation
 
 
@@ -380,7 +381,7 @@ CASES = {
 
 def load(path: Path) -> Gaussians:
     """A fitted model (numpy), moved and scaled to stand around the origin with radius 1."""
-    gaussians = Gaussians.load(path / "point_cloud.ply" if path.is_dir() else path)
+    gaussians = Gaussians.load(own_gaussians(path) if path.is_dir() else path)
     orbit = orbit_of_gaussians(gaussians, np.array([0.0, 0.0, 1.0]), FIELD_OF_VIEW)
     radius = orbit.radius * np.sin(np.radians(FIELD_OF_VIEW / 2))
     return Similarity(1 / radius, np.eye(3), -orbit.focus / radius).of_gaussians(gaussians)

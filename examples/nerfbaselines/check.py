@@ -231,7 +231,7 @@ def scores_by_drgs(data: Path, checkpoint: Path) -> list[Row]:
     model = FitConfig.model_validate_json((checkpoint / "config.json").read_text()).model
     dataset = drgs.load_dataset(data)
     scene = make_scene(
-        drgs.Gaussians.load(checkpoint / "point_cloud.ply"), model, dataset.background
+        drgs.Gaussians.load(checkpoint / "point_cloud_drgs.ply"), model, dataset.background
     )
     images = [image.astype(np.float32) for image in render_views(scene, dataset.test)]
     targets = [np.asarray(view.image, np.float32) for view in dataset.test]

@@ -44,7 +44,7 @@ from drgs.training.trainer import Trainer
 
 ITERATIONS, ITERATIONS_BLENDER = 4500, 3000  # as ``drgs fit`` chooses for COLMAP and NeRF-synthetic
 
-GAUSSIANS, STATE, CONFIG = "point_cloud.ply", "state.npz", "config.json"  # files of a checkpoint
+GAUSSIANS, STATE, CONFIG = "point_cloud_drgs.ply", "state.npz", "config.json"  # of a checkpoint
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Order of nerfbaselines' distortion parameters."""

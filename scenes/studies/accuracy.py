@@ -42,7 +42,7 @@ from drgs.io.figures import new_figure, write_figure
 from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.results import metrics
-from drgs.results.folder import CONFIG, GAUSSIANS, GAUSSIANS_FOR_VIEWERS, require_results
+from drgs.results.folder import CONFIG, require_results, viewer_gaussians
 from drgs.results.model_arguments import error_budget
 from drgs.splatting import rendering
 
@@ -251,8 +251,7 @@ def load_subject(path: Path, num_views: int) -> Subject:
     if not path.is_dir():
         camera = bench_camera(FILM_SIZE_PX)
         return Subject(path.stem, bake_smoothing(Gaussians.load(path)), [camera], (1.0, 1.0, 1.0))
-    ply, config_file = path / GAUSSIANS_FOR_VIEWERS, path / CONFIG
-    ply = ply if ply.exists() else path / GAUSSIANS
+    ply, config_file = viewer_gaussians(path), path / CONFIG
     require_results(path, ply.name)
     config = load_config(str(config_file), [])
     gaussians = bake_smoothing(Gaussians.load(ply))

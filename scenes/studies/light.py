@@ -27,7 +27,7 @@ from drgs.gaussians.parameters import Gaussians
 from drgs.io.figures import new_figure, write_figure
 from drgs.io.scenes import load_scene_file
 from drgs.results import metrics
-from drgs.results.folder import GAUSSIANS
+from drgs.results.folder import own_gaussians
 from fits import SCENES
 
 if TYPE_CHECKING:
@@ -339,7 +339,7 @@ def main() -> None:
     args = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     path = Path(args.scene)
-    ply = path / GAUSSIANS if path.is_dir() else path
+    ply = own_gaussians(path) if path.is_dir() else path
     counts = (
         (QUICK_PATHS, QUICK_REFERENCE_PATHS, QUICK_ROUNDS)
         if args.quick

@@ -35,7 +35,7 @@ from drgs.integrator.scene import make_scene, render_views
 from drgs.io.colmap import read_model
 from drgs.io.images import image_size, read_image, write_png
 from drgs.poses.structure_from_motion import SfmSettings, reconstruct
-from drgs.results.folder import GAUSSIANS, load_run_config
+from drgs.results.folder import load_run_config, own_gaussians
 from drgs.results.metrics import mean_of
 from fits import add_case_option, fit_words, make_parser
 
@@ -115,7 +115,7 @@ CASES = (
 def psnr_of_test_views(fitted: Path, config: FitConfig) -> float:
     """Return the PSNR of a fit's Gaussians on the dataset's test views."""
     run_config = load_run_config(fitted)
-    gaussians = Gaussians.load(fitted / GAUSSIANS)
+    gaussians = Gaussians.load(own_gaussians(fitted))
     dataset = load_dataset(config.data).relative_to(gaussians.origin)
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")

@@ -34,7 +34,7 @@ from drgs.core.environment import denormals_flushed
 from drgs.core.processes import end_job_on_error, process_number
 from drgs.datasets import load_dataset
 from drgs.gaussians.parameters import Gaussians
-from drgs.results.folder import GAUSSIANS, load_run_config
+from drgs.results.folder import load_run_config, own_gaussians
 from drgs.training.parallel import exchange
 from drgs.training.parallel.communicator import Communicator
 from drgs.training.trainer import Trainer
@@ -130,7 +130,7 @@ def run_process(folder: Path, views: int, threads: int) -> None:
         "optimizer.views_per_step": views,
     }
     config = with_changes(load_run_config(folder), changes)
-    dataset, gaussians = load_dataset(config.data), Gaussians.load(folder / GAUSSIANS)
+    dataset, gaussians = load_dataset(config.data), Gaussians.load(own_gaussians(folder))
     comm = TimedCommunicator() if process_number() is None else TimedCommunicator.world()
     exchange.wait = comm.timed(exchange.wait)
     with denormals_flushed():

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 from support.commands import assert_ends_well, assert_refused
-from support.folders import contents
+from support.folders import contents, to_earlier_layout
 from support.formats import (
     FLOAT32,
     PRECISION,
@@ -58,9 +58,9 @@ def fit(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     configure(folder, FITTED_WITH)
-    replace(blobs(20), rendered_with=FITTED_WITH).save(folder / "point_cloud.ply")
+    replace(blobs(20), rendered_with=FITTED_WITH).save(folder / "point_cloud_drgs.ply")
     viewers = replace(blobs(30), rendered_with=VIEWER_RENDERING)
-    viewers.save(folder / "point_cloud_viewers.ply")
+    viewers.save(folder / "point_cloud.ply")
     write_views(folder / "views.json", make_dataset(6, 1))
     return folder
 
@@ -84,24 +84,29 @@ def test_each_format_is_written_beside_its_source(model, each):
     assert read_gaussians(out)[0].name == each.name
 
 
-def test_export_uses_the_file_for_viewers_or_notes_what_they_miss(fit):
+@pytest.mark.parametrize("is_earlier", [False, True])
+def test_export_uses_the_file_for_viewers_or_notes_what_they_miss(fit, is_earlier):
+    own, for_viewers = "point_cloud_drgs.ply", "point_cloud.ply"
+    if is_earlier:
+        to_earlier_layout(fit)
+        own, for_viewers = "point_cloud.ply", "point_cloud_viewers.ply"
     outcome = run(fit, "--format", "glb")
     assert outcome.stdout.splitlines() == [
-        f"{fit}/point_cloud_viewers.ply: 30 Gaussians",
+        f"{fit}/{for_viewers}: 30 Gaussians",
         "up: 0 0 1 (the training cameras')",
         f"written: {fit}.glb (0.0 MB)",
     ]
     found = Gaussians.load(fit.with_name("run.glb"))
     assert found.rendered_with is None and found.num_gaussians == 30
 
-    outcome = run(fit / "point_cloud.ply", "--out", fit.with_name("a.glb"))
-    assert f"export {fit}/point_cloud_viewers.ply instead" in outcome.stdout
+    outcome = run(fit / own, "--out", fit.with_name("a.glb"))
+    assert f"export {fit}/{for_viewers} instead" in outcome.stdout
     assert Gaussians.load(fit.with_name("a.glb")).rendered_with == FITTED_WITH
 
-    (fit / "point_cloud_viewers.ply").unlink()
+    (fit / for_viewers).unlink()
     outcome = run(fit, "--format", "spz")
     note = "made to be rendered with low_pass 0.1, antialiased true; programs that do not will show"
-    assert f"note: {fit}/point_cloud.ply: {note}" in outcome.stdout
+    assert f"note: {fit}/{own}: {note}" in outcome.stdout
     assert "no room for low_pass 0.1" in outcome.stdout
     assert Gaussians.load(fit.with_name("run.spz")).rendered_with == {"antialiased": True}
 
@@ -110,14 +115,14 @@ def test_export_uses_the_file_for_viewers_or_notes_what_they_miss(fit):
 def test_playcanvas_export_uses_the_file_with_the_nearer_low_pass(fit, low_pass, is_nearer):
     """Its viewers add 0.075 square pixels, and 0.1875 is in the middle to 0.3."""
     fitted = {"antialiased": True, "low_pass": low_pass}
-    replace(blobs(20), rendered_with=fitted).save(fit / "point_cloud.ply")
+    replace(blobs(20), rendered_with=fitted).save(fit / "point_cloud_drgs.ply")
     configure(fit, fitted)
     outcome = run(fit, "--format", "compressed-ply")
-    name = "point_cloud.ply: 20" if is_nearer else "point_cloud_viewers.ply: 30"
+    name = "point_cloud_drgs.ply: 20" if is_nearer else "point_cloud.ply: 30"
     assert outcome.stdout.splitlines()[0] == f"{fit}/{name} Gaussians"
     found = Gaussians.load(fit.with_name("run.compressed.ply")).rendered_with
     assert found == (fitted if is_nearer else None)
-    outcome = run(fit / "point_cloud.ply", "--format", "compressed-ply")
+    outcome = run(fit / "point_cloud_drgs.ply", "--format", "compressed-ply")
     assert ("made to be rendered with" in outcome.stdout) == (not is_nearer)
 
 
@@ -232,7 +237,10 @@ def test_floaters_and_clusters_are_removed_in_world_coordinates(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "number", "left", "views"),
-    [(".", "50%", 15, "6 views of the fit"), ("point_cloud.ply", 7, 7, "64 views around the m")],
+    [
+        (".", "50%", 15, "6 views of the fit"),
+        ("point_cloud_drgs.ply", 7, 7, "64 views around the m"),
+    ],
 )
 def test_decimated_file_has_that_many_gaussians_and_the_same_bytes_again(
     fit, monkeypatch, what, number, left, views
@@ -316,7 +324,7 @@ def test_up_direction_uses_refined_cameras(fit, optimise):
     turn[:3, :3] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
     dataset = make_dataset(6, 1)
     views = [replace(v, camera_to_world=turn @ v.camera_to_world) for v in dataset.train]
-    write_views(fit / "cameras.json", replace(dataset, train=views))
+    write_views(fit / "refined_cameras.json", replace(dataset, train=views))
     configure(fit, FITTED_WITH, cameras={"optimise": optimise})
     outcome = run(fit, "--format", "glb", "--up", "cameras")
     up = "0 -1 0" if optimise else "0 0 1"
@@ -394,9 +402,9 @@ def exported(what, out, *options):
 def test_page_of_a_fit_shows_its_own_gaussians_if_the_page_supports_them(fit, tmp_path, order):
     configure(fit, {**FITTED_WITH, "order": order})
     said, page, scene, gaussians = exported(fit, tmp_path / "a.html")
-    name, count, low_pass = ("point_cloud.ply", 20, 0.1)
+    name, count, low_pass = ("point_cloud_drgs.ply", 20, 0.1)
     if order == "pixel":
-        name, count, low_pass = ("point_cloud_viewers.ply", 30, 0.3)
+        name, count, low_pass = ("point_cloud.ply", 30, 0.3)
     assert said.splitlines()[0] == f"{fit}/{name}: {count} Gaussians"
     assert "note" not in said and gaussians.num_gaussians == count
     assert scene["lowPass"] == pytest.approx(low_pass)
@@ -405,7 +413,7 @@ def test_page_of_a_fit_shows_its_own_gaussians_if_the_page_supports_them(fit, tm
     assert page.texts["title"].strip() == "run: Gaussian splats"
 
 
-@pytest.mark.parametrize("name", ["point_cloud.ply", "."])
+@pytest.mark.parametrize("name", ["point_cloud_drgs.ply", "."])
 def test_file_is_shown_as_a_whole_with_z_up(fit, tmp_path, name):
     options = ("--up", 0, 0, 1) if name == "." else ()
     _, _, scene, gaussians = exported(fit / name, tmp_path / "a.html", *options)
@@ -434,7 +442,7 @@ def test_mesh_is_where_the_gaussians_are(fit, tmp_path, monkeypatch):
         "a.ply": (fit, 6),
         "a.glb": (fit, 6, "--up", 0, 0, 1),
         "b.ply": (fit, 6, "--up", 0, 1, 0),
-        "c.ply": (fit / "point_cloud.ply", 24),
+        "c.ply": (fit / "point_cloud_drgs.ply", 24),
     }
     for name, (what, num_views, *options) in cases.items():
         out = tmp_path / name

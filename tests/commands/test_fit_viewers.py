@@ -4,9 +4,12 @@ The page itself is tested in ``tests/viewer``.
 """
 
 import json
+import os
 import socket
 import sys
 from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
 from types import ModuleType
 from unittest.mock import Mock
 
@@ -23,7 +26,7 @@ from support.fit_command import (
 )
 from support.folders import contents
 from support.render_command import run as render
-from support.small_capture import HEIGHT, WIDTH, decibels, double, photograph, pose_around
+from support.small_capture import HEIGHT, WIDTH, blobs, decibels, double, photograph, pose_around
 
 from drgs.config.load import load_config
 from drgs.datasets import load_dataset
@@ -34,7 +37,15 @@ from drgs.fit.live_view import TrainingViewer, unless_ended
 from drgs.gaussians.parameters import Gaussians
 from drgs.live_page.frames import FrameRequest, ViewerCamera
 from drgs.live_page.scheduler import RenderRequests
-from drgs.results.folder import GAUSSIANS, GAUSSIANS_FOR_VIEWERS, METRICS, remove_run
+from drgs.results.folder import (
+    EARLIER_FOR_VIEWERS,
+    GAUSSIANS,
+    METRICS,
+    OWN_GAUSSIANS,
+    own_gaussians,
+    remove_run,
+    viewer_gaussians,
+)
 
 EYE = ViewerCamera(pose_around(0.4, 0.3), 40.0, 4.0)
 
@@ -145,7 +156,7 @@ def fitted(tmp_path_factory):
 def test_metrics_include_what_viewers_show(fitted, tmp_path):
     """Both files record their approximations; the float64 reference renders as viewers do."""
     out, outcome = fitted
-    native, other = (Gaussians.load(out / name) for name in (GAUSSIANS, GAUSSIANS_FOR_VIEWERS))
+    native, other = (Gaussians.load(out / name) for name in (OWN_GAUSSIANS, GAUSSIANS))
     assert native.rendered_with == FITTED_WITH
     assert other.rendered_with == {"antialiased": False, "low_pass": 0.3}
     assert native.num_gaussians == other.num_gaussians and (native.means != other.means).any()
@@ -158,9 +169,9 @@ def test_metrics_include_what_viewers_show(fitted, tmp_path):
     found = metrics["viewers"]
     assert found["psnr"] == pytest.approx(np.mean(scores), abs=1e-3)
     assert (found["split"], found["num_views"]) == ("test", 2)
-    assert f"{GAUSSIANS_FOR_VIEWERS}: PSNR {found['psnr']:.2f} dB" in outcome.stdout
+    assert f"{GAUSSIANS}: PSNR {found['psnr']:.2f} dB" in outcome.stdout
 
-    render(out / GAUSSIANS_FOR_VIEWERS, "--scene", out / "config.yml", "--out", tmp_path)
+    render(out / GAUSSIANS, "--scene", out / "config.yml", "--out", tmp_path)
     again = json.loads((tmp_path / METRICS).read_text())
     assert again["mean"]["psnr"] == found["psnr"]
 
@@ -175,9 +186,9 @@ def test_resumed_fit_gives_the_same_bytes(fitted, tmp_path, monkeypatch):
         broken.setattr("drgs.fit.session.for_viewers", lambda *_: sys.exit(7))
         with pytest.raises(SystemExit):
             fit.main([str(config), "--out", str(tmp_path / "out")])
-    assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
+    assert not (tmp_path / "out" / GAUSSIANS).exists()
     assert_ends_well(fit.main, "--resume", tmp_path / "out")
-    for name in (GAUSSIANS, GAUSSIANS_FOR_VIEWERS):
+    for name in (GAUSSIANS, OWN_GAUSSIANS):
         assert (tmp_path / "out" / name).read_bytes() == (out / name).read_bytes()
     remove_run(tmp_path / "out")
     assert contents(tmp_path / "out") == {}
@@ -188,7 +199,42 @@ def test_fit_with_viewer_approximations_writes_one_file(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "drgs.fit.viewers_fit", raising=False)
     monkeypatch.delitem(sys.modules, "drgs.effects.smoothing", raising=False)
     assert_fits(write_project(tmp_path), "--out", tmp_path / "out")
-    assert not (tmp_path / "out" / GAUSSIANS_FOR_VIEWERS).exists()
+    assert not (tmp_path / "out" / OWN_GAUSSIANS).exists()
     assert "viewers" not in json.loads((tmp_path / "out" / METRICS).read_text())
     assert not {"drgs.fit.viewers_fit", "drgs.effects.smoothing"} & set(sys.modules)
     assert Gaussians.load(tmp_path / "out" / GAUSSIANS).rendered_with is None
+
+
+OWN, FOR_VIEWERS = (replace(blobs(2), rendered_with={"low_pass": p}) for p in (0.1, 0.3))
+BOTH = replace(OWN, rendered_with=None)
+FOLDERS = {
+    "empty": {},
+    "one file": {GAUSSIANS: BOTH},
+    "two files": {GAUSSIANS: FOR_VIEWERS, OWN_GAUSSIANS: OWN},
+    "earlier version": {GAUSSIANS: OWN, EARLIER_FOR_VIEWERS: FOR_VIEWERS},
+}
+
+
+@pytest.mark.parametrize("after", ["one file", "two files"])
+@pytest.mark.parametrize("before", FOLDERS)
+def test_files_are_of_their_kind_at_every_moment(tmp_path, monkeypatch, before, after):
+    for name, each in FOLDERS[before].items():
+        each.save(tmp_path / name)
+
+    def checked(step):
+        def call(*arguments, **options):
+            for read, kind in ((own_gaussians, OWN), (viewer_gaussians, FOR_VIEWERS)):
+                if (path := read(tmp_path)).exists():
+                    shown = Gaussians.load(path).rendered_with
+                    assert shown in (None, kind.rendered_with)
+            return step(*arguments, **options)
+
+        return call
+
+    monkeypatch.setattr(os, "replace", checked(os.replace))
+    monkeypatch.setattr(Path, "unlink", checked(Path.unlink))
+    files = FOLDERS[after]
+    fit_folder.write_gaussians(tmp_path, files.get(OWN_GAUSSIANS, BOTH), files[GAUSSIANS])
+    assert {*os.listdir(tmp_path)} == {*files}
+    for name, each in files.items():
+        assert Gaussians.load(tmp_path / name).rendered_with == each.rendered_with

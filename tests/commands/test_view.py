@@ -12,7 +12,7 @@ from support.small_capture import FOCUS, RADIUS, make_dataset
 import drgs
 from drgs.cli.commands import CommandParser
 from drgs.core.errors import UserError
-from drgs.effects.cameras import CAMERAS
+from drgs.effects.cameras import REFINED_CAMERAS
 from drgs.live_page.page import StartView
 from drgs.results.folder import VIEWS
 from drgs.results.model import load_model
@@ -37,7 +37,7 @@ def test_fit_is_viewed_from_its_training_cameras(fit, tmp_path, refined):
         yaml.safe_dump({"cameras": {"optimise": refined}}, file)
     few, others = make_dataset(train=3), make_dataset(train=5)
     write_views(run / VIEWS, few)
-    write_views(run / CAMERAS, others)
+    write_views(run / REFINED_CAMERAS, others)
     _, model, cameras = opened(run)
     assert model.background == (1.0, 1.0, 1.0)  # of its configuration
     for camera, expected in zip(cameras, (others if refined else few).train, strict=True):

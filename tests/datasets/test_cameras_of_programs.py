@@ -1,6 +1,7 @@
 """Cameras of other programs: points land where the program's own equations put them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,11 @@ from support.datasets import load, load_noting, refusal, views_by_name
 
 from drgs.config.load import config_from
 from drgs.core.errors import UserError
+from drgs.effects.cameras import REFINED_CAMERAS
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import start_of
+from drgs.results.folder import CAMERAS
+from drgs.results.refined_cameras import write_pinholes, write_views
 
 WIDTH, HEIGHT, NAMES = 64, 48, ("a.png", "b.png", "c.png", "d.png")
 POINTS = np.random.default_rng(5).uniform(-0.5, 0.5, (20, 3))
@@ -188,6 +192,47 @@ def test_photographs_of_a_half_of_the_size_are_used(tmp_path):
     (tmp_path / "images").mkdir()  # empty, as an archive may have it
     view = load(tmp_path, test_every=4).train[0]
     assert (view.width, view.fx, view.fy, view.cx) == (32, 35, 37.5, 16)
+
+
+def camera_to_json(index, name, view):
+    """Numbers of ``camera_to_JSON`` of the 3DGS reference, with its R and T of a camera."""
+    world_to_camera = np.linalg.inv(view.camera_to_world)
+    R, T = world_to_camera[:3, :3].T, world_to_camera[:3, 3]
+    Rt = np.eye(4)
+    Rt[:3, :3], Rt[:3, 3] = R.T, T
+    pose, size = np.linalg.inv(Rt), (view.width, view.height)
+    angles = [2 * np.arctan(n / (2 * f)) for n, f in zip(size, (view.fx, view.fy), strict=True)]
+    fx, fy = (n / (2 * np.tan(angle / 2)) for n, angle in zip(size, angles, strict=True))
+    text = {"id": index, "img_name": name, "width": size[0], "height": size[1]}
+    return text, [*pose[:3, 3], *pose[:3, :3].ravel(), fx, fy]
+
+
+@pytest.mark.parametrize("is_refined", [False, True])
+def test_cameras_that_a_fit_writes_are_those_of_the_reference(tmp_path, is_refined):
+    """By its equations, and by the reader; the folder itself is no dataset."""
+    write_3dgs(photographs(tmp_path))
+    dataset, out = load(tmp_path, test_every=4, ignore_points=True), tmp_path / "out"
+    out.mkdir()
+    (out / "config.yml").write_text(f"data: {{path: a}}\ncameras: {{optimise: {is_refined}}}\n")
+    moved = [v.with_offset(np.array([0.1, 0.2, 0.3])) for v in dataset.train]
+    moved = [replace(v, fx=1.1 * v.fx, fy=1.2 * v.fy) for v in moved]
+    write_views(out / REFINED_CAMERAS, replace(dataset, train=tuple(moved)))
+    write_pinholes(out, dataset)
+    expected = moved if is_refined else dataset.train
+    cameras = json.loads((out / CAMERAS).read_text())
+    for index, (camera, view) in enumerate(zip(cameras, expected, strict=True)):
+        text, numbers = camera_to_json(index, dataset.train[index].name, view)
+        position, *rows = camera.pop("position"), *camera.pop("rotation")
+        found = [*position, *np.ravel(rows), camera.pop("fx"), camera.pop("fy")]
+        np.testing.assert_allclose(found, numbers, atol=1e-12)
+        assert camera == text
+    assert refusal(out).startswith(f"{out}: ")
+    photographs(out, [f"{view.name}.png" for view in dataset.train])
+    views = views_by_name(load(out))
+    for given, view in zip(dataset.train, expected, strict=True):
+        read = views[given.name]
+        np.testing.assert_allclose(read.camera_to_world, view.camera_to_world, atol=1e-12)
+        assert (read.fx, read.fy) == pytest.approx((view.fx, view.fy))
 
 
 REFUSED = {

@@ -130,7 +130,7 @@ def test_a_checkpoint_renders_the_same_and_continues_to_the_same_bytes(method_mo
     loaded.save(tmp_path / "again")
     resumed = method_module.DrgsMethod(checkpoint=tmp_path / "first", train_dataset=dataset)
     resumed.save(tmp_path / "resumed")
-    for name in ("point_cloud.ply", "state.npz", "config.json"):
+    for name in ("point_cloud_drgs.ply", "state.npz", "config.json"):
         expected = (tmp_path / "first" / name).read_bytes()
         assert (tmp_path / "again" / name).read_bytes() == expected
         assert (tmp_path / "resumed" / name).read_bytes() == expected

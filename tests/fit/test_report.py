@@ -202,7 +202,7 @@ def test_page_has_no_external_references_and_its_images_are_complete(page, out, 
     # The icon, the orbit and its first frame, comparisons, curves, the worst photographs.
     assert len(embedded) == 1 + 2 + 3 * 3 + 6 + min(6, len(dataset.train))
     # To be downloaded, and to walk around in.
-    links = {"point_cloud.ply", "point_cloud_viewers.ply", "viewer.html"}
+    links = {"point_cloud.ply", "point_cloud_drgs.ply", "viewer.html"}
     assert set(page.references) - set(embedded) == links
     for outside in ("http:", "https:", "file:", "//", "@import", "url(", "<script"):
         assert outside not in re.sub(r"base64,[A-Za-z0-9+/=]*", "", page.source), outside

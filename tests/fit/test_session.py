@@ -110,7 +110,7 @@ def folder(tmp_path, monkeypatch):
 def test_train_gives_the_bytes_of_the_command(folder):
     """From a file, from nested mappings, and from a configuration with its dataset."""
     fit.main([str(folder / "a.yml"), "--out", str(folder / "out")])
-    expected = (folder / "out" / "point_cloud.ply").read_bytes()
+    expected = (folder / "out" / "point_cloud_drgs.ply").read_bytes()
     history = (folder / "out" / "history.csv").read_text().splitlines()[1:]
     dataset = drgs.load_dataset("data")
     for arguments in ((folder / "a.yml",), (CONFIG,), (load_config("a.yml"), dataset)):

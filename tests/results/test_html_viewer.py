@@ -153,7 +153,7 @@ def test_first_view_uses_refined_cameras(tmp_path):
         folder.mkdir()
         config = {"data": {"path": "data"}, "cameras": {"optimise": folder.name == "refined"}}
         (folder / "config.yml").write_text(yaml.safe_dump(config))
-        write_views(folder / "cameras.json", replace(dataset, train=far))
+        write_views(folder / "refined_cameras.json", replace(dataset, train=far))
         write(folder, dataset)
         found = gaussians_of((folder / "viewer.html").read_bytes(), tmp_path / "a.ply")
         sizes.append(np.ptp(found.means, axis=0))

@@ -33,7 +33,7 @@ iterations: 4
 def enter_folder(namespace) -> None:
     """Enter a folder with small files under the names that programs read."""
     folder = Path(tempfile.mkdtemp())
-    path = folder / "out" / "lego" / "point_cloud.ply"
+    path = folder / "out" / "lego" / "point_cloud_drgs.ply"
     path.parent.mkdir(parents=True)
     host_gaussians(Scene(count=20, degree=3).gaussians).save(path)
     write_dataset(folder / "scenes" / "lego", make_dataset(train=3, test=1))

@@ -20,7 +20,7 @@ from drgs.cameras.viewpoints import CameraMotion
 from drgs.core.errors import UserError
 from drgs.datasets.camera_file import read_viewpoints
 from drgs.datasets.images import smaller_view
-from drgs.effects.cameras import CAMERAS, INTRINSICS
+from drgs.effects.cameras import INTRINSICS, REFINED_CAMERAS
 from drgs.integrator.scene import render_views
 from drgs.results.refined_cameras import refined_dataset
 
@@ -114,8 +114,8 @@ def test_cameras_are_unchanged_before_the_start():
     ],
 )
 def test_damaged_cameras_are_refused(text, tmp_path):
-    (tmp_path / CAMERAS).write_text(text)
-    with pytest.raises(UserError, match=r"cameras\.json: must hold .* remove it"):
+    (tmp_path / REFINED_CAMERAS).write_text(text)
+    with pytest.raises(UserError, match=r"refined_cameras\.json: must hold .* remove it"):
         refined_dataset(fits.plain_dataset(), tmp_path)
 
 
@@ -255,12 +255,12 @@ def test_refined_cameras_survive_a_round_trip(tmp_path):
     dataset = replace(dataset, train=(moving(views[0]), *views[1:]))
     trainer = fits.with_numbers(make_trainer(dataset, **CAMERA_RATES), **random_numbers())
     effect_of(trainer).write(tmp_path, dataset)
-    frames = json.loads((tmp_path / CAMERAS).read_text())["frames"]
+    frames = json.loads((tmp_path / REFINED_CAMERAS).read_text())["frames"]
     assert [frame["file_path"] for frame in frames] == [view.name for view in dataset.train]
     assert frames[0]["shutter"] == "rolling"
     smaller = replace(dataset, train=tuple(smaller_view(view, 2) for view in dataset.train))
     found = refined_dataset(smaller, tmp_path)
-    cameras = [*read_viewpoints(tmp_path / CAMERAS, None), *found.train]
+    cameras = [*read_viewpoints(tmp_path / REFINED_CAMERAS, None), *found.train]
     for k, (camera, view) in enumerate(zip(cameras, (*dataset.train, *smaller.train), strict=True)):
         expected = moved(view, **row_of(random_numbers(), k % 6))
         # Single precision, of numbers up to 4.
@@ -273,7 +273,7 @@ def test_refined_cameras_survive_a_round_trip(tmp_path):
     between = np.linalg.inv(photo.camera_to_world) @ photo.motion.close_to_world
     begin = np.linalg.inv(found.train[0].camera_to_world)
     np.testing.assert_allclose(begin @ close, between, atol=1e-9)
-    (tmp_path / CAMERAS).unlink()
+    (tmp_path / REFINED_CAMERAS).unlink()
     assert refined_dataset(dataset, tmp_path) is dataset
 
 

@@ -12,6 +12,7 @@ from support.viewer_rendering import VIEWER_RENDERING
 import drgs  # noqa: F401  (registers the plugin)
 from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.results.folder import own_gaussians
 from drgs.training.steps import view_of
 
 
@@ -74,7 +75,8 @@ def test_fit_writes_the_filter_or_baked_gaussians(tmp_path, monkeypatch):
     for bakes in ("false", "true"):
         out = tmp_path / bakes
         assert_fits(config, "--out", out, "--set", f"output.bake_smoothing={bakes}")
-        written.append(Gaussians.load(out / "point_cloud.ply"))
+        written.append(Gaussians.load(own_gaussians(out)))
+        assert Gaussians.load(out / "point_cloud.ply").smoothing is None
     filtered, baked = written
     assert baked.smoothing is None and (baked.log_scales > filtered.log_scales).all()
     expected = bake_smoothing(filtered)

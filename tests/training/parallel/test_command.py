@@ -43,7 +43,7 @@ def command(*words):
 def result(folder):
     with (folder / "history.csv").open(newline="") as file:
         rows = [{k: v for k, v in row.items() if k != "wall_s"} for row in csv.DictReader(file)]
-    names = ("point_cloud.ply", "point_cloud_viewers.ply")
+    names = ("point_cloud.ply", "point_cloud_drgs.ply")
     return [(folder / name).read_bytes() for name in names], rows
 
 
