@@ -39,7 +39,7 @@ from drgs.training.trainer import Trainer
 
 OUTPUTS = (
     *("point_cloud.ply", "metrics.json", "history.csv", "density.csv", "config.yml"),
-    *("curves.png", "orbit.webp", "report.html", "viewer.html", "views.json"),
+    *("curves.png", "orbit.webp", "report.html", "viewer.html", "views.json", "cameras.json"),
     *(f"{kind}/test/r_{i}.png" for kind in ("renders", "side_by_side") for i in range(3)),
 )
 

@@ -38,7 +38,7 @@ LAST = 7  # iteration after which the clock ends a fit
 
 RESULTS = {
     *("config.yml", "point_cloud.ply", "history.csv", "density.csv", "views.json"),
-    *("metrics.json", "report.html"),
+    *("cameras.json", "metrics.json", "report.html"),
     *(f"{kind}/test/r_{i}.png" for kind in ("renders", "side_by_side") for i in range(2)),
 }
 

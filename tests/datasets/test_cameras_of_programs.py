@@ -209,7 +209,7 @@ def camera_to_json(index, name, view):
 
 @pytest.mark.parametrize("is_refined", [False, True])
 def test_cameras_that_a_fit_writes_are_those_of_the_reference(tmp_path, is_refined):
-    """By its equations, and by the reader; the folder itself is no dataset."""
+    """Equations of the reference and the reader agree; the folder itself is no dataset."""
     write_3dgs(photographs(tmp_path))
     dataset, out = load(tmp_path, test_every=4, ignore_points=True), tmp_path / "out"
     out.mkdir()

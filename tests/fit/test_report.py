@@ -230,7 +230,7 @@ def test_page_contains_the_metrics_and_the_best_median_and_worst_view(page, data
         "1 min 15 s", "1,200 iterations", "A <Processor>, 2 threads", "2026-11-23 01:02 (UTC+0100)",
         "drgs fit 'my scene.yml' --data <DIR>", "Seed 7", "drgs 1.2.3, Mitsuba 3.9.1",
         "16.0", "LLVM 19.1.7", "sh_increase_every: 1000", "path: photographs",
-        "Population budget: 1,000 \u2192 2,400 Gaussians", "they show 4 test views at 29.88 dB",
+        "Population budget: 1,000 \u2192 2,400 Gaussians", "viewers show 4 test views at 29.88 dB",
     ):  # fmt: skip
         assert stated in page.text, stated
     pairs = zip(dataset.test, images, strict=True)
