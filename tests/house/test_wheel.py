@@ -19,6 +19,7 @@ from support.small_capture import blobs, make_dataset, write_dataset
 
 from drgs.gaussians.parameters import Gaussians
 from drgs.io.images import write_png
+from drgs.results.folder import own_gaussians
 
 pytestmark = [
     pytest.mark.slow,
@@ -243,7 +244,7 @@ def test_external_package_can_use_every_extension_point(scripts, photographs):
     run(scripts / "python", "-c", PROGRAM, cwd=folder)
     with np.load(folder / "yaml.npz") as named, np.load(folder / "python.npz") as given:
         assert len(named["means"]) == 30
-        fitted = Gaussians.load(folder / "out" / "point_cloud.ply")
+        fitted = Gaussians.load(own_gaussians(folder / "out"))
         np.testing.assert_array_equal(fitted.means, given["means"])
     short = ("--set", "iterations=4", "--set", "init.num_points=60", "--set", "output.report=false")
     shown = run(scripts / "drgs", "fit", "bent", *short, "--out", "bent_out", cwd=folder)
