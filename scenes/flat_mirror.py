@@ -1,7 +1,7 @@
 """Light in a flat mirror against the mirrored camera: ``python scenes/flat_mirror.py``.
 
 A cloud of splats hangs over a mirror, out of the camera's sight. What the mirror shows is what the
-camera that is mirrored in its plane sees: float64 rays of that (``drgs.reference.rays``) through
+camera that is mirrored in its plane sees: float64 rays of that (``studies.reference_rays``) through
 every pixel give the image that all are compared with. Prints a table.
 """
 
@@ -14,9 +14,10 @@ import mitsuba as mi
 import numpy as np
 from drgs.bench.output import markdown_table
 from drgs.cli.commands import bounded_int
-from drgs.reference.rays import ImageModel, render_along
 from drgs.reference.splatting import Gaussians
 from drgs.results import metrics
+
+from studies.reference_rays import ImageModel, render_along
 
 LIGHTS = {
     "none": {},

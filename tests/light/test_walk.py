@@ -15,9 +15,9 @@ from support.helpers import (
     single,
 )
 from support.rays import Rays, composite_segments, num_met, splats_of
+from support.studies import reference_rays as image_reference
 from support.views import VIEWS, splats_before
 
-from drgs.reference import rays as image_reference
 from drgs.reference import splatting
 from drgs.splatting.footprint import Cutoffs
 

@@ -9,10 +9,11 @@ import numpy as np
 
 from drgs.core.arrays import types_of
 from drgs.light.walk import RaySplats, Segment
-from drgs.reference import rays, splatting
+from drgs.reference import splatting
 from drgs.splatting.footprint import Cutoffs
 from drgs.splatting.projection import load_rows
 from support.helpers import device_gaussians
+from support.studies import reference_rays as rays
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def splats_of(gaussians: splatting.Gaussians, precision, cutoffs=Cutoffs()) -> R
 
 @dataclass(frozen=True)
 class SegmentRadiance:
-    """What the reference composites along R segments: all Gaussians with their peak on one."""
+    """Light along R segments as the reference composites it: Gaussians with their peak on one."""
 
     colors: np.ndarray  # (R, 3) display space, sum of w_i c_i
     transmittances: np.ndarray  # (R,)
@@ -56,7 +57,7 @@ class SegmentRadiance:
 
 
 def composite_segments(gaussians, origins, directions, far, close=0.0, **choices):
-    """choices: of ``ImageModel``, such as ``alpha_cut``."""
+    """Composite each segment by itself; choices: of ``ImageModel``, such as ``alpha_cut``."""
     model = rays.ImageModel("exact", order="pixel", low_pass=0, **choices)
     given = (each[None] for each in (origins, directions))  # an image of one row
     seen = rays.render_along(gaussians, *given, far=far, model=model, threshold_width=close)

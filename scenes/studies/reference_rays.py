@@ -1,8 +1,9 @@
 """The reference, one approximation at a time: each that 3DGS makes is a choice here.
 
-It imports nothing of this package but ``reference``, and is to be read after it. The default
-``ImageModel`` is ``reference.render``; every field of it replaces one approximation, so that a
-kernel which makes other choices has an independent float64 computation to agree with.
+Studies and tests import it. It imports nothing of drgs but ``drgs.reference``, and is to be read
+after it. The default ``ImageModel`` is ``reference.render``; every field of it replaces one
+approximation, so that a kernel which makes other choices has an independent float64 computation to
+agree with.
 
 Where ``reference`` walks over splats, this file works on matrices of P pixels by N splats::
 
@@ -46,11 +47,10 @@ from typing import Literal, TypeVar, cast
 
 import numpy as np
 import pydantic
-from numpy.typing import ArrayLike
-from pydantic import Field
-
 from drgs.reference import splatting as reference
 from drgs.reference.splatting import Camera, Gaussians, RenderedImage
+from numpy.typing import ArrayLike
+from pydantic import Field
 
 Rows = TypeVar("Rows")  # a dataclass of arrays (N, ...)
 
