@@ -1,7 +1,7 @@
 """Light in a flat mirror against the mirrored camera: ``python scenes/flat_mirror.py``.
 
 A cloud of splats hangs over a mirror, out of the camera's sight. What the mirror shows is what the
-camera that is mirrored in its plane sees: float64 rays of that (``drgs.reference.light``) through
+camera that is mirrored in its plane sees: float64 rays of that (``studies.reference_rays``) through
 every pixel give the image that all are compared with. Prints a table.
 """
 
@@ -14,9 +14,10 @@ import mitsuba as mi
 import numpy as np
 from drgs.bench.output import markdown_table
 from drgs.cli.commands import bounded_int
-from drgs.reference import light as reference
 from drgs.reference.splatting import Gaussians
 from drgs.results import metrics
+
+from studies.reference_rays import ImageModel, render_along
 
 LIGHTS = {
     "none": {},
@@ -98,12 +99,14 @@ def mirrored_camera(splats: Gaussians, size: int) -> np.ndarray:
     up = np.cross(right, forward)  # what is up in the mirror image is down on the film
     place = (2 * (np.arange(size * SIDE) + 0.5) / (size * SIDE) - 1) * np.tan(np.deg2rad(15))
     x, y = np.meshgrid(place, place)
-    towards = (forward + x[..., None] * right + y[..., None] * up).reshape(-1, 3)
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    starts = origin - (origin[1] / towards[:, 1])[:, None] * towards
-    seen = reference.composite_segments(splats, starts, towards, np.full(len(towards), np.inf))
-    coverage = 1 - seen.transmittances[:, None]
-    color = seen.colors / np.where(coverage > 0, coverage, 1)
+    towards = forward + x[..., None] * right + y[..., None] * up
+    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    starts = origin - (origin[1] / towards[..., 1])[..., None] * towards
+    model = ImageModel("exact", order="pixel", low_pass=0)
+    rows = zip(starts[:, None], towards[:, None], strict=True)  # one at a time
+    seen = [render_along(splats, *row, model=model) for row in rows]
+    coverage = np.concatenate([row.alpha for row in seen])[..., None]
+    color = np.concatenate([row.image for row in seen]) / np.where(coverage > 0, coverage, 1)
     linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
     return (coverage * linear).reshape(size, SIDE, size, SIDE, 3).mean((1, 3))
 

@@ -34,7 +34,7 @@ from drgs.capture.path_tracing import (
 )
 from drgs.cli.progress import RunProgress
 from drgs.core.errors import UserError, one_line
-from drgs.core.files import atomic_path, read_text, remove_stale_temporaries, write_json
+from drgs.core.files import read_text, remove_stale_temporaries, write_bytes, write_json
 from drgs.io.images import read_image, to_uint8, write_png
 from drgs.io.ply import COLOR, POSITION, encode_elements
 
@@ -228,8 +228,7 @@ def write_points(path: Path, positions: np.ndarray, colors: np.ndarray) -> None:
     columns = dict(zip((*POSITION, *COLOR), (*positions.T, *colors.T), strict=True))
     dtype = [(name, column.dtype) for name, column in columns.items()]
     rows = np.rec.fromarrays(list(columns.values()), dtype=dtype)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(encode_elements({"vertex": rows}))
+    write_bytes(path, encode_elements({"vertex": rows}))
 
 
 def _value_text(key: str, value: object) -> str:

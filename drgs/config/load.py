@@ -17,7 +17,7 @@ from drgs.config.schema import FitConfig
 from drgs.config.section import ExtensibleSection, expectation, format_value, set_value
 from drgs.core.errors import UserError, did_you_mean, format_names, one_line
 from drgs.core.file_kinds import describe_file
-from drgs.core.files import atomic_path, read_text
+from drgs.core.files import read_text, write_bytes
 
 PATH_KEYS = ("data.path", "init.point_cloud", "init.gaussians", "output.dir")  # made absolute
 
@@ -54,16 +54,13 @@ def config_from(
 def dump_config(config: FitConfig, path: str | Path) -> None:
     """Write all values of ``config`` as YAML for :func:`load_config`."""
     text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_bytes(path, text.encode())
 
 
 def known_keys(model: type[BaseModel] = FitConfig, prefix: str = "") -> list[str]:
     """Return dotted names of every section and value, such as ``densify.every``."""
-    sections, keys = (
-        {name: _section(field.annotation) for name, field in model.model_fields.items()},
-        [],
-    )
+    sections = {name: _section(field.annotation) for name, field in model.model_fields.items()}
+    keys: list[str] = []
     if issubclass(model, ExtensibleSection):
         sections |= {extension.name: extension.section for extension in model.extensions()}
     for name, section in sections.items():

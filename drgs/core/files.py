@@ -180,10 +180,15 @@ def write_together(folder: Path, files: Mapping[str, bytes]) -> None:
             (folder / name).unlink(missing_ok=True)
 
 
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file, in one piece; see :func:`atomic_path`."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
 def write_json(path: Path, content: object, indent: int = 1) -> None:
     """Write a file of JSON, in one piece."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
+    write_bytes(path, (json.dumps(content, indent=indent) + "\n").encode())
 
 
 def remove_stale_temporaries(folder: Path) -> None:

@@ -116,8 +116,7 @@ MEMORY = MemoryStore()
 
 def is_on_disk(view: View) -> bool:
     """Return whether images of the view are read from disk at each use."""
-    images = (view.image, view.alpha, view.mask, view.depth)
-    return any(isinstance(image, LazyImage) and image.is_on_disk for image in images)
+    return any(isinstance(each, LazyImage) and each.is_on_disk for each in view.planes().values())
 
 
 # Masks and depths
@@ -271,35 +270,27 @@ def smaller_view(view: View, factor: int) -> View:
     width, height = downscaled_size(view.width, view.height, new_width)
     x, y = width / view.width, height / view.height
 
-    def smaller(
-        image: Pixels | None, scale: Callable[[np.ndarray, int | None], np.ndarray] = downscale
-    ) -> LazyImage | None:
-        if image is None:
-            return None
+    def smaller(name: str, image: Pixels) -> LazyImage:
+        scale = {"mask": downscale_mask, "depth": downscale_depth}.get(name, downscale)
         shape = (height, width, *image.shape[2:])
         on_disk = isinstance(image, LazyImage) and image.is_on_disk
         return LazyImage(shape, lambda: scale(np.asarray(image), new_width), 0, None, on_disk)
 
     return replace(
         view,
-        image=smaller(view.image),
         fx=view.fx * x,
         fy=view.fy * y,
         cx=view.cx * x,
         cy=view.cy * y,
         width=width,
         height=height,
-        alpha=smaller(view.alpha),
-        mask=smaller(view.mask, downscale_mask),
-        depth=smaller(view.depth, downscale_depth),
+        **{name: smaller(name, image) for name, image in view.planes().items()},
     )
 
 
 def with_arrays(view: View) -> View:
     """Return the view with arrays for its lazy images, which are then computed once."""
-    images = {name: getattr(view, name) for name in ("image", "alpha", "mask", "depth")}
-    arrays = {name: np.asarray(each) for name, each in images.items() if each is not None}
-    return replace(view, **arrays)
+    return replace(view, **{name: np.asarray(each) for name, each in view.planes().items()})
 
 
 def shift_pixels(view: View) -> tuple[View, ...]:
@@ -308,10 +299,9 @@ def shift_pixels(view: View) -> tuple[View, ...]:
     These are half a pixel to the right, below, or both. Trained on in turns, they show a fit all
     pixels of the file, not means of the same four alone.
     """
-    both = {"image": view.image, "alpha": view.alpha}
-    planes = {name: plane for name, plane in both.items() if plane is not None}
+    planes = view.planes()
     shifted = {n: p.shifted for n, p in planes.items() if isinstance(p, LazyImage) and p.shifted}
-    if len(shifted) < len(planes) or view.mask is not None or view.depth is not None:
+    if len(shifted) < len(planes):  # masks and depths never can be
         return (view,)
     views, on_disk = [view], is_on_disk(view)
     for x, y in ((1, 0), (0, 1), (1, 1)):
@@ -469,9 +459,7 @@ def unread_image(shape: tuple[int, ...], name: object, is_shifted: bool = False)
 def without_images(view: View) -> View:
     """Return the view as if another process had read its images."""
     unread = {}
-    for name in ("image", "alpha", "mask", "depth"):
-        plane = getattr(view, name)
-        if plane is not None:
-            is_shifted = isinstance(plane, LazyImage) and plane.shifted is not None
-            unread[name] = unread_image(plane.shape, view.name, is_shifted)
+    for name, plane in view.planes().items():
+        is_shifted = isinstance(plane, LazyImage) and plane.shifted is not None
+        unread[name] = unread_image(plane.shape, view.name, is_shifted)
     return replace(view, **unread)

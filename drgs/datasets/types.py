@@ -67,6 +67,11 @@ class View(Viewpoint):
     depth: Pixels | None = None  # (height, width) float32, scene units; 0 where not known
     files: Mapping[str, Path] = field(default_factory=dict)  # of image, mask, depth
 
+    def planes(self) -> dict[str, Pixels]:
+        """Return the images that there are, by field."""
+        planes = {name: getattr(self, name) for name in ("image", "alpha", "mask", "depth")}
+        return {name: plane for name, plane in planes.items() if plane is not None}
+
 
 ViewFilter = Callable[[str], bool]  # accepts names of views whose images are to be read
 

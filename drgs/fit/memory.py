@@ -101,7 +101,7 @@ def max_num_gaussians(config: FitConfig, start: int) -> int:
 
 def _photograph_bytes(view: View, scale: float) -> float:
     """Return the bytes of a view's images, or of the numbers of smaller ones if these take less."""
-    images = [p for p in (view.image, view.alpha, view.mask, view.depth) if p is not None]
+    images = view.planes().values()
     numbers = 4 * scale**2 * sum(math.prod(image.shape) for image in images)
     return min(sum(image.nbytes for image in images), numbers)
 

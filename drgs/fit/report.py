@@ -23,7 +23,7 @@ from PIL import Image
 
 from drgs.cameras.orbits import orbit_of_views, orbit_size
 from drgs.cameras.viewpoints import field_of_view
-from drgs.core.files import atomic_path
+from drgs.core.files import write_bytes
 from drgs.datasets.images import downscale
 from drgs.datasets.types import Dataset, View, evenly_spaced
 from drgs.fit.curves import NUM_PANELS, Panel, draw_curve, panels_of, write_curves
@@ -231,8 +231,7 @@ def write_report(
         training_views="".join(_row(each.name, f"{each.psnr:.2f}") for each in ranked),
         config=html.escape(yaml.safe_dump(metrics["config"], sort_keys=False)),
     )
-    with atomic_path(path) as temporary:
-        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")
+    write_bytes(path, page.encode("utf-8", "backslashreplace"))
 
 
 def choose_views(scores: Sequence[float]) -> list[tuple[str, int]]:

@@ -18,7 +18,7 @@ from drjit.auto.ad import Array3f, Array4f, Matrix3f
 
 from drgs.core.arrays import from_host, real_numbers, types_of
 from drgs.core.errors import UserError, check_type, note_user
-from drgs.core.files import atomic_path
+from drgs.core.files import write_bytes
 from drgs.core.origin import WORLD, Origin, format_origin
 from drgs.core.registry import HOW_TO_INSTALL
 from drgs.core.types import TensorXf
@@ -85,9 +85,7 @@ class Gaussians(Generic[Tensor]):
         if chosen is None:
             suffixes = ", ".join(each.value.suffix for each in writable_formats())
             raise UserError(f"{path}: the name must end in one of {suffixes}; {HOW_TO_INSTALL}")
-        content = self.to_bytes(chosen.name)
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(content)
+        write_bytes(path, self.to_bytes(chosen.name))
 
     def to_bytes(self, name: str) -> bytes:
         """Return what ``save`` writes in the format ``name`` of ``drgs.io.formats.FORMATS``."""

@@ -22,7 +22,15 @@ import numpy as np
 from typing_extensions import override
 
 from drgs.cameras.camera import Camera
-from drgs.core.arrays import divide, from_host, interleave, quotient, repeat_array, types_of
+from drgs.core.arrays import (
+    divide,
+    from_host,
+    interleave,
+    planes_of,
+    quotient,
+    repeat_array,
+    types_of,
+)
 from drgs.core.errors import UnsupportedError
 from drgs.core.types import Float
 from drgs.splatting.footprint import PixelCenters, SamplePositions
@@ -100,11 +108,8 @@ def pixels_adjoint(
     A film develops each pixel by the same linear map, found once by developing unit images: the
     derivative of ``develop`` itself would be scattered atomically.
     """
-    matrix = film_map(film, maps, aovs)
-    pixel = dr.arange(mi.UInt32, grad_in.shape[0] * grad_in.shape[1])
-    count = len(matrix)
-    developed = [dr.gather(mi.Float, grad_in.array, pixel * count + k) for k in range(count)]
-    columns = (zip(column, developed, strict=True) for column in matrix.T)
+    developed = planes_of(grad_in)
+    columns = (zip(column, developed, strict=True) for column in film_map(film, maps, aovs).T)
     return [sum((float(w) * d for w, d in column if w), mi.Float(0)) for column in columns]
 
 

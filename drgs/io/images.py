@@ -19,7 +19,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageCms, ImageFile, PngImagePlugin, UnidentifiedImageError
 
 from drgs.core.errors import UserError, one_line
-from drgs.core.files import atomic_path, open_regular, refuse_damage
+from drgs.core.files import open_regular, refuse_damage, write_bytes
 from drgs.core.memory import require_memory
 
 if TYPE_CHECKING:
@@ -219,7 +219,7 @@ def write_png(path: Path, image: np.ndarray, text: Mapping[str, str] | None = No
     chunks = PngImagePlugin.PngInfo()
     for name, words in (text or {}).items():
         chunks.add_text(name, words)
-    _write(path, encode(image, "png", pnginfo=chunks))
+    write_bytes(path, encode(image, "png", pnginfo=chunks))
 
 
 def write_exr(path: Path, bitmap: mi.Bitmap) -> None:
@@ -231,7 +231,7 @@ def write_exr(path: Path, bitmap: mi.Bitmap) -> None:
     stream = mi.MemoryStream()  # an error of the disk is then Python's, and names the file
     with openexr_threads():
         bitmap.write(stream, mi.Bitmap.FileFormat.OpenEXR)
-    _write(path, stream.raw_buffer())
+    write_bytes(path, stream.raw_buffer())
 
 
 def encode(image: np.ndarray, suffix: str, **options: Any) -> bytes:
@@ -267,7 +267,7 @@ def write_animation(path: Path, frames: Iterable[np.ndarray]) -> None:
         if len(data) <= WEBP_BYTES:
             break
     assert data is not None, "there is at least one quality"
-    _write(path, data)
+    write_bytes(path, data)
 
 
 def _encode_lossless(frames: np.ndarray) -> bytes | None:
@@ -303,8 +303,3 @@ def _commonest_color(pixels: np.ndarray) -> tuple[np.ndarray, float]:
     most = numbers[np.argmax(counts)]
     color = np.array([most >> 16, most >> 8 & 255, most & 255], np.uint8)
     return color, float(counts.max() / counts.sum())
-
-
-def _write(path: Path, data: bytes) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)

@@ -23,6 +23,7 @@ from drgs.config.approximations import DECLARED, Approximations
 from drgs.config.schema import ModelConfig
 from drgs.gaussians.parameters import Gaussians
 from drgs.integrator.scene import NEAR_CLIP, film_description, make_scene, make_sensors
+from drgs.io.images import to_uint8
 from drgs.results.metrics import psnr
 
 MAX_SCENES = 2  # scenes kept, each with a copy of the Gaussians: ``error`` needs two
@@ -194,8 +195,7 @@ FRAME_CONTENTS: dict[str, Callable[[LiveScene, FrameRequest], ViewerFrame]] = {
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
     """Return (H, W, 3) uint8 of the first three channels, clamped to [0, 1]; NaN is black."""
-    image = np.nan_to_num(np.clip(image[:, :, :3], 0, 1), nan=0.0)
-    return np.round(image * 255).astype(np.uint8)
+    return to_uint8(np.nan_to_num(image[:, :, :3]))
 
 
 def over_backdrop(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from drgs.cameras.orbits import Orbit, orbit_of_gaussians, orbit_of_views
 from drgs.cameras.viewpoints import FIELD_OF_VIEW, Viewpoint
 from drgs.config.approximations import Approximations
 from drgs.core.errors import note_user
-from drgs.core.files import atomic_path
+from drgs.core.files import write_bytes
 from drgs.core.origin import WORLD
 from drgs.datasets.types import Dataset
 from drgs.gaussians.parameters import Gaussians
@@ -172,8 +172,7 @@ def write_viewer(out: Path, dataset: Dataset, shown: DisplaySettings) -> None:
     views = refined_viewpoints(out, dataset.origin) or dataset.train
     initial_view = InitialView.from_views(views, gaussians)
     page = viewer_page(out.resolve().name, shown, initial_view, dataset.background)
-    with atomic_path(out / VIEWER) as temporary:
-        temporary.write_bytes(page)
+    write_bytes(out / VIEWER, page)
 
 
 def _file_bytes(num_gaussians: int, sh_degree: int) -> int:

@@ -18,6 +18,7 @@ import drgs  # noqa: F401  (chooses libLLVM before Dr.Jit is imported)
 import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
+import reference_rays
 from drgs.accuracy.error_budget import Search
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.bench.output import (
@@ -39,7 +40,6 @@ from drgs.effects.smoothing import bake_smoothing
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.error_budget import renderer_of
 from drgs.io.figures import new_figure, write_figure
-from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.results import metrics
 from drgs.results.folder import CONFIG, require_results, viewer_gaussians

@@ -1,7 +1,7 @@
 """Does an error budget keep its word at views that it has not measured, by an independent truth?
 
 Twelve kinds of scene are rendered by the plugin with an error budget. The truth is
-``drgs.reference.rays``: numpy in double precision, the peak of each Gaussian along each pixel's
+``reference_rays``: numpy in double precision, the peak of each Gaussian along each pixel's
 ray, in the order of the peaks, without cut-offs; it shares no code with the kernels. Errors are
 root mean squares of display values.
 """
@@ -17,10 +17,10 @@ from typing import Any
 import drgs  # noqa: F401  (chooses libLLVM)
 import mitsuba as mi
 import numpy as np
+import reference_rays as rays
 from drgs.accuracy.error_budget import measured_places
 from drgs.bench.output import machine, markdown_table
 from drgs.core.errors import UserError
-from drgs.reference import rays
 from drgs.reference.splatting import Gaussians
 from scipy.spatial.transform import Rotation
 

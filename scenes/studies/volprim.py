@@ -21,12 +21,12 @@ from pathlib import Path
 import drgs  # noqa: F401  (registers the integrator)
 import mitsuba as mi
 import numpy as np
+import reference_rays
 from accuracy import Subject, add_scene, load_subject
 from drgs.bench.output import markdown_table
 from drgs.bench.scenes import mitsuba_sensor
 from drgs.bench.speed import SHELL_STDS, volprim_scene
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.results import metrics
 

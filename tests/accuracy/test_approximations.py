@@ -18,11 +18,11 @@ from support.helpers import (
 )
 from support.kernels import float_reductions
 from support.reference_lenses import gaussians_at
+from support.studies import reference_rays
 
 from drgs.accuracy import pixel_order
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
-from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 

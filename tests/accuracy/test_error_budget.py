@@ -15,7 +15,7 @@ from PIL import Image
 from support.commands import assert_refused
 from support.render_command import run, sensor, write_scene
 from support.small_capture import pose_around
-from support.studies import load_study
+from support.studies import load_study, reference_rays
 from support.views import Scene, tensors
 
 from drgs.accuracy import error_budget as budgets
@@ -30,7 +30,6 @@ from drgs.integrator import error_budget as error_budget_of_scenes
 from drgs.integrator.error_budget import renderer_of
 from drgs.integrator.scene import film_description
 from drgs.io.scenes import openexr_threads
-from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.render import __main__ as render
 from drgs.render.images import viewpoints_of

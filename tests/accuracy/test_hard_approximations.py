@@ -34,12 +34,12 @@ from support.helpers import (
     rows,
     single,
 )
+from support.studies import reference_rays
 
 from drgs.accuracy import exact, unscented
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES
-from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.splatting import projection, rendering
 

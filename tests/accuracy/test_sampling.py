@@ -9,6 +9,7 @@ import pytest
 from support.backgrounds import CLOSE, EMITTERS, rendered, texels
 from support.cases import CASES, MODEL_FIELDS, planes_of, reference_camera
 from support.helpers import FLOAT64, NEAR_THRESHOLD
+from support.studies import reference_rays
 from support.views import VIEWS, Scene, image_of, side_by_side
 from support.wall_scenes import Wall
 from support.wall_scenes import load as load_wall
@@ -17,7 +18,6 @@ import drgs  # noqa: F401  (registers the plugin)
 from drgs.core.arrays import from_host
 from drgs.gaussians.parameters import PARAMETER_NAMES
 from drgs.integrator.film import PIXELS_PER_PASS, DrawnSamples, SamplePoints
-from drgs.reference import rays as reference_rays
 from drgs.reference import splatting as reference
 from drgs.splatting import rendering
 from drgs.testing import Case, laws_of

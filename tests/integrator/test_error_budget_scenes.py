@@ -8,6 +8,7 @@ import drjit.llvm.ad as llvm
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.studies import reference_rays as rays
 
 import drgs  # noqa: F401  (registers the plugins)
 from drgs.bench.scenes import device_camera
@@ -15,7 +16,6 @@ from drgs.config.approximations import Approximations
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator import error_budget
 from drgs.integrator.sensors import camera_from_sensor, read_sensor
-from drgs.reference import rays
 from drgs.reference import splatting as reference
 
 BUDGET, WIDTH, HEIGHT, FOV, DISTANCE = 0.02, 48, 32, 40, 4.0

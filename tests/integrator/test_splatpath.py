@@ -14,11 +14,11 @@ from support.lit_scenes import (
     radiance_of,
     scene_of,
 )
+from support.rays import composite_segments
 from support.reference_lenses import gaussians_at
 from support.views import to_linear
 
 import drgs  # noqa: F401  (registers the plugins)
-from drgs.reference import light as reference
 
 
 def room():
@@ -91,7 +91,7 @@ def test_a_mirror_shows_the_mirrored_gaussians(has_sky):
     scene = scene_of(splats, light_samples=0, **cutoffs, **mirror)
     rendered = along_rays(scene, origins, directions)
     mirrored = replace(splats, means=np.float32(means * [1, 1, -1]))
-    seen = reference.composite_segments(
+    seen = composite_segments(
         mirrored, origins, directions, np.full(len(origins), np.inf), **cutoffs
     )
     expected = radiance_of(seen, is_open=not has_sky)

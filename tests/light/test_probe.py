@@ -6,14 +6,13 @@ import drjit as dr
 import numpy as np
 import pytest
 from support.helpers import FLOAT32, both_precisions, device_gaussians, rows
-from support.rays import Rays
+from support.rays import Rays, composite_segments
 from support.reference_lenses import gaussians_at
 
 from drgs.accuracy.pipeline import pipeline_of
 from drgs.config.approximations import Approximations
 from drgs.core.arrays import types_of
 from drgs.light import probe
-from drgs.reference import light as reference
 from drgs.reference import splatting
 from drgs.splatting.rendering import color_features, depth_feature
 
@@ -71,7 +70,7 @@ def test_probe_matches_rays_from_its_centre(precision, number):
     probes = probes_of(gaussians, precision)
     origins = np.tile(CENTERS[number], (2000, 1))
     rays = Rays.towards(origins, CENTERS[number] + directions(2000, 5))
-    expected = reference.composite_segments(gaussians, rays.origins, rays.directions, rays.far)
+    expected = composite_segments(gaussians, rays.origins, rays.directions, rays.far)
     color, coverage, is_known = look(probes, rays, precision, number)
     assert is_known.all() and (expected.transmittances < 0.5).sum() > 50
     np.testing.assert_allclose(coverage, 1 - expected.transmittances, atol=1.2e-3 + 1 / 255)
@@ -88,7 +87,7 @@ def test_probe_shows_the_same_surface_off_its_centre_to_rays_that_reach_it():
     probes, gaussians = probes_of(shell(), FLOAT32), shell()
     starts = 0.5 * directions(600, 6) * np.random.default_rng(7).random((600, 1))
     rays = Rays.towards(starts, starts + directions(600, 8))
-    expected = reference.composite_segments(gaussians, rays.origins, rays.directions, rays.far)
+    expected = composite_segments(gaussians, rays.origins, rays.directions, rays.far)
     color, coverage, is_known = look(probes, rays, FLOAT32)
     unmoved, _, _ = look(probes, Rays.towards(0 * starts, rays.directions), FLOAT32)
     errors = [np.abs(seen - expected.colors).mean() for seen in (color, unmoved)]

@@ -23,10 +23,11 @@ from support.reference_scenes import (
     small_scene,
     with_invisible,
 )
+from support.studies import reference_rays as rays
 
-from drgs.reference import rays
 from drgs.reference import splatting as reference
-from drgs.reference.rays import ImageModel
+
+ImageModel = rays.ImageModel
 
 UNCUT = ImageModel(alpha_max=1.0, alpha_cut=0.0, transmittance_stop=0.0)
 """No decisions: every splat touches every pixel."""

@@ -12,11 +12,10 @@ import pytest
 from PIL import Image
 from support import small_capture
 from support.helpers import reference_gaussians
-from support.studies import load_study
+from support.studies import load_study, reference_rays
 
 from drgs.bench.scenes import bench_camera, bench_gaussians
 from drgs.core.errors import UserError
-from drgs.reference import rays as reference_rays
 from drgs.results import metrics
 
 accuracy, stability = map(load_study, ("accuracy", "stability"))

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from drgs.cameras.motion import MotionBlur, RollingShutter
 from drgs.core.arrays import types_of
-from drgs.reference import rays
 from drgs.reference import splatting as reference
 from drgs.testing import Case, Values, adjoint_is_transpose, bytes_are_reproducible, single
 from support import helpers, lenses, reference_effects
@@ -29,6 +28,7 @@ from support.lens_scenes import (
     row_time,
     seen_points,
 )
+from support.studies import reference_rays as rays
 
 MOTION_SAMPLES = 3
 PINHOLE = lenses.Pinhole()

@@ -13,6 +13,7 @@ from drgs.reference import splatting
 from drgs.splatting.footprint import Cutoffs
 from drgs.splatting.projection import load_rows
 from support.helpers import device_gaussians
+from support.studies import reference_rays as rays
 
 
 @dataclass(frozen=True)
@@ -44,3 +45,28 @@ def _single(values) -> np.ndarray:
 def splats_of(gaussians: splatting.Gaussians, precision, cutoffs=Cutoffs()) -> RaySplats:  # noqa: B008
     loaded = load_rows(device_gaussians(gaussians, precision), gaussians.sh_degree)
     return RaySplats.from_gaussians(loaded, gaussians.sh_degree, cutoffs)
+
+
+@dataclass(frozen=True)
+class SegmentRadiance:
+    """Light along R segments as the reference composites it: Gaussians with their peak on one."""
+
+    colors: np.ndarray  # (R, 3) display space, sum of w_i c_i
+    transmittances: np.ndarray  # (R,)
+    is_close: np.ndarray  # (R,) bool: a decision was taken by less than ``close``, relative
+
+
+def composite_segments(gaussians, origins, directions, far, close=0.0, **choices):
+    """Composite each segment by itself; choices: of ``ImageModel``, such as ``alpha_cut``."""
+    model = rays.ImageModel("exact", order="pixel", low_pass=0, **choices)
+    given = (each[None] for each in (origins, directions))  # an image of one row
+    seen = rays.render_along(gaussians, *given, far=far, model=model, threshold_width=close)
+    return SegmentRadiance(seen.image[0], seen.transmittance[0], seen.near_threshold[0])
+
+
+def num_met(gaussians, origins, directions, far, **choices) -> np.ndarray:
+    """Number of Gaussians that each of R segments meets: all have the same small alpha."""
+    alpha = 1e-6
+    choices |= {"alpha_max": alpha, "transmittance_stop": 0}
+    seen = composite_segments(gaussians, origins, directions, far, **choices)
+    return np.rint(np.log(seen.transmittances) / np.log1p(-alpha))

@@ -12,3 +12,7 @@ def load_study(name: str) -> ModuleType:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(REPOSITORY / "scenes" / "studies")
         return import_module(name)
+
+
+reference_rays = load_study("reference_rays")
+"""The float64 reference along rays, which studies and tests share."""

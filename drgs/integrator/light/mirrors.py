@@ -26,6 +26,7 @@ from drgs.cameras.lens import Lens, Pinhole
 from drgs.config.approximations import Approximations
 from drgs.effects.compose import with_effects
 from drgs.gaussians.parameters import Gaussians
+from drgs.integrator.film import decode
 from drgs.integrator.light.rays import PathSegment, StraightRays, has_transparent_parts
 from drgs.integrator.sensors import SensorState, camera_from_sensor
 from drgs.light.probe import LOW_PASS, ProbeHit, bilinear_texels
@@ -267,9 +268,7 @@ def _render_mirror(
     order = replace(pipeline.order, depths=depths)
     T, *color = render(gaussians, camera, replace(pipeline, order=order)).planes()
     coverage = 1 - T
-    color = mi.Color3f(color) / dr.select(coverage > 0, coverage, 1)
-    color = coverage * mi.math.srgb_to_linear(color)
-    colors = mi.Float(dr.ravel(mi.Vector4f(*color, coverage)))
+    colors = mi.Float(dr.ravel(mi.Vector4f(*decode(mi.Color3f(color), coverage), coverage)))
     dr.eval(colors, ends)
     return colors, ends
 

@@ -1,8 +1,9 @@
 """The reference, one approximation at a time: each that 3DGS makes is a choice here.
 
-It imports nothing of this package but ``reference``, and is to be read after it. The default
-``ImageModel`` is ``reference.render``; every field of it replaces one approximation, so that a
-kernel which makes other choices has an independent float64 computation to agree with.
+Studies and tests import it. It imports nothing of drgs but ``drgs.reference``, and is to be read
+after it. The default ``ImageModel`` is ``reference.render``; every field of it replaces one
+approximation, so that a kernel which makes other choices has an independent float64 computation to
+agree with.
 
 Where ``reference`` walks over splats, this file works on matrices of P pixels by N splats::
 
@@ -46,11 +47,10 @@ from typing import Literal, TypeVar, cast
 
 import numpy as np
 import pydantic
-from numpy.typing import ArrayLike
-from pydantic import Field
-
 from drgs.reference import splatting as reference
 from drgs.reference.splatting import Camera, Gaussians, RenderedImage
+from numpy.typing import ArrayLike
+from pydantic import Field
 
 Rows = TypeVar("Rows")  # a dataclass of arrays (N, ...)
 
@@ -236,9 +236,9 @@ def render_along(
     t = np.sum(m * v, axis=-1) / squared
     rho_sq = np.sum(np.cross(m, v) ** 2, axis=-1) / squared
     keys = t if centers is None else np.broadcast_to(centers, t.shape)
-    is_before = t < np.broadcast_to(far, (height, width)).reshape(-1, 1)
-    is_before &= np.isfinite(directions).all(axis=-1).reshape(-1, 1)
-    peaks = _Peaks(rho_sq, keys, keys, np.where(is_before, t, -inf))
+    within = np.minimum(t, np.broadcast_to(far, (height, width)).reshape(-1, 1) - t)
+    is_ray = np.isfinite(directions).all(axis=-1).reshape(-1, 1)
+    peaks = _Peaks(rho_sq, keys, keys, np.where(is_ray, within, -inf))
     opacities = reference.sigmoid(gaussians.logit_opacities)
     splats = cast(_Splats, SimpleNamespace(opacities=opacities, sh=gaussians.sh))
     weights, behind, marks = _composite(splats, peaks, np.zeros(len(t)), model, threshold_width)
@@ -584,8 +584,7 @@ def _follows_closely(keys: np.ndarray, width: float) -> np.ndarray:
     A splat that does not exist may stand between two that do: it is near a threshold itself.
     """
     with np.errstate(invalid="ignore"):  # of those that do not exist
-        steps = np.diff(keys, axis=1, prepend=-inf)
-    return steps <= width * np.abs(keys)
+        return np.diff(keys, axis=1, prepend=-inf) <= width * np.abs(keys)
 
 
 # ---- Small helpers ---------------------------------------------------------------------------
