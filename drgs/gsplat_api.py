@@ -76,8 +76,7 @@ GSPLAT_REMEDIES: dict[str, tuple[object, str]] = {
     "radius_clip": (0, "leave it out"),
     "thin_prism_coeffs ftheta_coeffs": (
         None,
-        "leave it out; other lenses are those of Mitsuba's sensor calibrated, which mi.render takes "
-        "with the integrator splats",
+        "leave it out; mi.render takes other lenses, by the sensor calibrated",
     ),
 }
 """gsplat's default, the only value allowed, and remedies for others, by the parameters of gsplat,
@@ -120,7 +119,7 @@ def accept_torch(function: Function) -> Function:
         if not given:
             return function(*args, **kwargs)
         if "means" not in given:
-            raise TypeError(f"rasterization(): means must be of PyTorch, as {[*given][0]} is")
+            raise TypeError(f"rasterization(): means must be of PyTorch, as {next(iter(given))} is")
         meta = {}
 
         @dr.wrap(source="torch", target="drjit")
@@ -131,7 +130,9 @@ def accept_torch(function: Function) -> Function:
             return images, alphas
 
         # Views, as dr.wrap leaves out parameters of modules, which are of a subclass.
-        images, alphas = differentiable({name: cast(Any, v).view_as(v) for name, v in given.items()})
+        images, alphas = differentiable(
+            {name: cast(Any, v).view_as(v) for name, v in given.items()}
+        )
         return images, alphas, meta
 
     return cast(Function, wrapped)
@@ -235,9 +236,7 @@ def rasterization(
         value = dr.detach(inputs[name].array)
         is_within = dr.all((value >= 0) & (value <= largest))
         _require(bool(is_within), name, f"numbers from 0 to {largest:g}", "others")
-    size = int(width), int(height)
-    is_attached = any(dr.grad_enabled(inputs[name]) for name in inputs.keys() & {*CAMERA_ARRAYS})
-    film = _Film(*size, float(near_plane), sh_degree, camera_model, shutter, is_attached)
+    film = _Film(int(width), int(height), float(near_plane), sh_degree, camera_model, shutter)
     _check_cameras(film, {k: np.array(inputs[k], np.float64) for k in CAMERA_ARRAYS if k in inputs})
     color = NamedFeature("colors") if sh_degree is None else color_features
     features = () if render_mode in ("D", "ED") else (color,)
@@ -246,13 +245,17 @@ def rasterization(
     views, pixels = [], []
     for values in _inputs_of_views(inputs, len(batch), by_camera):
         background = values.pop("backgrounds", None)
-        views.append(_View(film, pipeline, dr.detach(values)))
-        planes = dr.custom(_Planes, views[-1], values)
+        arrays = {name: values.pop(name) for name in CAMERA_ARRAYS if name in values}
+        camera = film.camera({name: _numbers(array) for name, array in arrays.items()})
+        dr.eval(camera)
+        views.append(_View(film, pipeline, camera, dr.detach(values)))
+        planes = dr.custom(_Planes, views[-1], values, camera.numbers())
         pixels.append(_image(film.in_rows(planes), background, render_mode))
     dr.eval(pixels)
     shape = (*batch, len(views) // max(math.prod(batch), 1))
     images, alphas = (
-        _stack_views([each[k] for each in pixels], (*shape, film.height, film.width)) for k in (0, 1)
+        _stack_views([each[k] for each in pixels], (*shape, film.height, film.width))
+        for k in (0, 1)
     )
     meta = _meta(views, shape)
     if dr.is_array_v(means):
@@ -362,13 +365,17 @@ def _check_cameras(film: _Film, arrays: Mapping[str, np.ndarray]) -> None:
         expected = f"None if camera_model is {film.model}"
         _require(name not in arrays, name, expected, "coefficients")
     expected = "k1 to k4, of shape (C, 4), if camera_model is fisheye"
-    _require(film.model != "fisheye" or radial.shape[-1] == 4, "radial_coeffs", expected, radial.shape)
+    _require(
+        film.model != "fisheye" or radial.shape[-1] == 4, "radial_coeffs", expected, radial.shape
+    )
     for name in ("radial_coeffs", "tangential_coeffs"):
         is_small = np.all(np.abs(arrays.get(name, 0)) <= MAX_COEFFICIENT)
         _require(bool(is_small), name, f"numbers of at most {MAX_COEFFICIENT:g} in size", "others")
     is_rolling, rows = film.shutter != "GLOBAL", film.camera_size[1]
     expected = f"{'given' if is_rolling else 'None'} if rolling_shutter is {film.shutter}"
-    _require(is_rolling == (ends is not None), "viewmats_rs", expected, None if ends is None else "it")
+    _require(
+        is_rolling == (ends is not None), "viewmats_rs", expected, None if ends is None else "it"
+    )
     expected = f"larger: {film.shutter} reads two rows or columns at least"
     _require(not is_rolling or rows > 1, "width and height", expected, (film.width, film.height))
     for index in np.ndindex(viewmats.shape[:-2]):
@@ -435,7 +442,6 @@ class _Film:
     sh_degree: int | None  # None: colours are given
     model: str
     shutter: str
-    is_camera_attached: bool  # whether derivatives with respect to cameras are needed
 
     @property
     def axes(self) -> tuple[int, int]:
@@ -445,7 +451,8 @@ class _Film:
     @property
     def camera_size(self) -> tuple[int, int]:
         """Width and height of the camera, px."""
-        return tuple((self.width, self.height)[axis] for axis in self.axes)
+        x, y = self.axes
+        return (self.width, self.height)[x], (self.width, self.height)[y]
 
     def in_rows(self, planes: list[Float]) -> list[Float]:
         """Return planes of the camera in the order of the image's pixels."""
@@ -457,20 +464,79 @@ class _Film:
         place = (pixel - row * size) * dr.opaque(t.UInt32, self.height) + row
         return [dr.gather(t.Float, p, place, mode=dr.ReduceMode.Permute) for p in planes]
 
+    def camera(self, values: Mapping[str, list[Float]]) -> Camera:
+        """Return the camera of arrays, given number by number, attached to them."""
+        t, K = types_of(type(values["Ks"][0])), values["Ks"]
+        axes, step = SHUTTERS[self.shutter]
+        names = [name for name in ("viewmats", "viewmats_rs")[::step] if name in values]
+        (rotation, center), *end = [self._pose(values[name]) for name in names]
+        width, height = self.camera_size
+        camera = Camera(
+            rotation=rotation,
+            center=center,
+            focal=t.Array2f([K[4 * axis] for axis in axes]),
+            principal=t.Array2f([K[3 * axis + 2] for axis in axes]),
+            # Opaque, or each value would be a new kernel.
+            film_start=t.Array2f(dr.opaque(t.Float, 0)),
+            film_end=t.Array2f([dr.opaque(t.Float, side) for side in (width, height)]),
+            near=dr.opaque(t.Float, self.near),
+            width=width,
+            height=height,
+        )
+        if end:
+            camera = _read_rows(camera, *end[0])
+        return camera.with_lens(self._lens(values))
 
-def _image(
-    planes: Sequence[Float], background: TensorXf | None, mode: str
-) -> tuple[Float, Float]:
+    def _pose(self, viewmat: Sequence[Float]) -> tuple[Matrix3f, Array3f]:
+        """Return rotation and centre, -R^-1 t in double precision."""
+        t = types_of(type(viewmat[0]))
+        t64 = types_of(cast(type, dr.float64_array_t(t.Float)))
+        rows = [viewmat[4 * axis : 4 * axis + 4] for axis in (*self.axes, 2)]
+        rotation = t64.Matrix3f([row[:3] for row in rows])
+        center = -(dr.rcp(rotation) @ t64.Array3f([row[3] for row in rows]))
+        return t.Matrix3f(rotation), t.Array3f(center)
+
+    def _lens(self, values: Mapping[str, list[Float]]) -> Lens:
+        if self.model == "ortho":
+            return Orthographic()
+        names = {"radial_coeffs": RADIAL, "tangential_coeffs": [TANGENTIAL[k] for k in self.axes]}
+        terms = [each for k in names for each in zip(names[k], values.get(k, ()), strict=False)]
+        if self.model == "pinhole" and not terms:
+            return PINHOLE
+        kind = ForwardFisheye if self.model == "fisheye" else RadialTangential
+        lens = kind.from_coefficients(**{name: dr.detach(value)[0] for name, value in terms})
+        return lens.with_coefficients(dict(terms))
+
+
+def _numbers(array: TensorXf) -> list[Float]:
+    """Return each number of an array, (1,), attached."""
+    t = types_of(type(array.array))
+    # Opaque, or each would be in a kernel of its own.
+    places = [dr.opaque(t.UInt32, k) for k in range(math.prod(array.shape))]
+    return [dr.gather(t.Float, array.array, k, mode=dr.ReduceMode.Permute) for k in places]
+
+
+def _read_rows(camera: Camera, rotation: Matrix3f, center: Array3f) -> Camera:
+    """Return the camera with a shutter that reads the last row at the given pose.
+
+    Row i, whose middle is at i + 1/2, is read at i / (height - 1): the film begins half a row
+    before the first pose, and ends half a row after the second.
+    """
+    motion = RollingShutter(*RollingShutter.relative_motion(camera, rotation, center))
+    rows, between = float(camera.height), camera.height - 1
+    start, scale = (dr.opaque(type(camera.near), x / between) for x in (-0.5, rows))
+    shutter = RollingShutter(motion.travel * scale, motion.turn * scale)
+    return replace(motion.pose(camera, start), shutter=shutter)
+
+
+def _image(planes: Sequence[Float], background: TensorXf | None, mode: str) -> tuple[Float, Float]:
     """Return the image of a view, pixel by pixel, and alpha; planes: see :class:`_Planes`."""
     transmittance, *features = planes
     count = len(features) - (mode != "RGB")
     channels, depths = features[:count], features[count:]
     if background is not None:
-        t, flat = types_of(type(transmittance)), background.array
-        # Opaque, or each would be in a kernel of its own.
-        places = [dr.opaque(t.UInt32, k) for k in range(count)]
-        behind = [dr.gather(t.Float, flat, k, mode=dr.ReduceMode.Permute) for k in places]
-        channels = [dr.fma(transmittance, b, c) for b, c in zip(behind, channels, strict=True)]
+        pairs = zip(_numbers(background)[:count], channels, strict=True)
+        channels = [dr.fma(transmittance, behind, channel) for behind, channel in pairs]
     alpha = 1 - transmittance
     if mode.endswith("ED"):
         depths = [depth / dr.select(alpha > MIN_ALPHA, alpha, MIN_ALPHA) for depth in depths]
@@ -485,25 +551,30 @@ def _stack_views(parts: list[Float], shape: tuple[int, ...]) -> TensorXf:
 
 
 class _Planes(dr.CustomOp):
-    """Custom operation: planes of a view (transmittance, features), from its inputs."""
+    """Custom operation: planes of a view (transmittance, features), from arrays and camera."""
 
     @override
-    def eval(self, view: _View, inputs: dict[str, TensorXf]) -> list[Float]:
-        self.view, self.inputs = view, inputs
+    def eval(self, view: _View, arrays: dict[str, TensorXf], numbers: list[Float]) -> list[Float]:
+        self.view, self.arrays = view, arrays
         planes = view.frame.planes()
         dr.eval(planes)  # or storing them would run the kernels once for each
         return planes
 
     @override
     def forward(self) -> None:
-        self.set_grad_out(self.view.tangents(cast(dict[str, TensorXf], self.grad_in("inputs"))))
+        d_arrays, d_numbers = (cast(Any, self.grad_in(name)) for name in ("arrays", "numbers"))
+        dr.make_opaque(d_numbers)  # or each value of a literal would be a new kernel
+        self.set_grad_out(self.view.tangents(d_arrays, d_numbers))
 
     @override
     def backward(self) -> None:
-        gradients = self.view.gradients(cast(list[Float], self.grad_out()))
-        flat = {name: cast(Float, dr.ravel(gradients[name])) for name in self.inputs}
-        pairs = self.inputs.items()
-        self.set_grad_in("inputs", {k: type(v)(flat[k], v.shape) for k, v in pairs})
+        gradients, camera = self.view.gradients(cast(Any, self.grad_out()))
+        self.set_grad_in(
+            "arrays",
+            {k: dr.reshape(type(v), gradients[k], v.shape) for k, v in self.arrays.items()},
+        )
+        if camera is not None:
+            self.set_grad_in("numbers", camera)
 
     @override
     def name(self) -> str:
@@ -531,32 +602,32 @@ class ForwardFisheye(Fisheye):
 class _View:
     """Planes of one camera, and their derivatives."""
 
-    def __init__(self, film: _Film, pipeline: Pipeline, inputs: Mapping[str, TensorXf]) -> None:
-        """Render; inputs: detached."""
-        self.film, self.inputs = film, inputs
-        self.types = types_of(type(inputs["means"].array))
-        # On the host, to compute the centre in float64.
-        self.host = {n: np.array(inputs[n], np.float64).ravel() for n in CAMERA_ARRAYS if n in inputs}
-        camera = self._camera(self._leaves(self.host))
-        dr.make_opaque(camera)
-        self.gaussians = self._gaussians(inputs)
+    def __init__(
+        self, film: _Film, pipeline: Pipeline, camera: Camera, arrays: Mapping[str, TensorXf]
+    ) -> None:
+        """Render; arrays: detached."""
+        self.film = film
+        self.gaussians = self._gaussians(arrays)
+        self.is_camera_attached, camera = dr.grad_enabled(camera.numbers()), dr.detach(camera)
         self.pipeline = with_effects(pipeline, self.gaussians, camera)
         self.frame = render(self.gaussians, camera, self.pipeline)
 
-    def tangents(self, directions: Mapping[str, TensorXf]) -> list[Float]:
-        """Return tangents of the planes from those of the inputs."""
+    def tangents(self, directions: Mapping[str, TensorXf], d_numbers: list[Float]) -> list[Float]:
+        """Return tangents of the planes from those of the arrays and the camera's numbers."""
         d_gaussians = self._gaussians(directions)
-        d_camera = self._camera_tangents(directions) if self.film.is_camera_attached else None
+        d_camera = d_numbers if self.is_camera_attached else None
         (d_planes,) = frames_tangent(self.gaussians, [self.frame], d_gaussians, d_camera)
         dr.eval(d_planes)
         return d_planes
 
-    def gradients(self, d_planes: list[Float]) -> Mapping[str, TensorXf | Float]:
-        """Return gradients of the inputs from those of the planes."""
+    def gradients(
+        self, d_planes: list[Float]
+    ) -> tuple[dict[str, TensorXf | Float], list[Float] | None]:
+        """Return gradients of the arrays and of the camera's numbers from those of the planes."""
         dr.eval(d_planes)
-        with_camera = self.film.is_camera_attached
+        with_camera = self.is_camera_attached
         adjoint = frames_adjoint(self.gaussians, [self.frame], [d_planes], with_camera)
-        d, t = adjoint.parameters, self.types
+        d = adjoint.parameters
         assert d is not None and d.features is not None, "of self.gaussians, projected here"
         gradients: dict[str, TensorXf | Float] = {
             "means": d.means,
@@ -565,13 +636,12 @@ class _View:
             "opacities": d.features["opacities"],
             "colors": d.features["colors"] if self.film.sh_degree is None else d.sh,
         }
-        if adjoint.camera is not None:
-            return gradients | self._camera_gradients(adjoint.camera)
-        return gradients | {n: dr.zeros(t.Float, len(values)) for n, values in self.host.items()}
+        return gradients, adjoint.camera
 
     def _gaussians(self, values: Mapping[str, TensorXf]) -> Gaussians:
         """Return values, or tangents, of the Gaussians."""
-        num, t, colors = values["means"].shape[0], self.types, values["colors"]
+        num, t = values["means"].shape[0], types_of(type(values["opacities"].array))
+        colors = values["colors"]
         features = {
             "scales": values["scales"],
             "opacities": t.TensorXf(values["opacities"].array, (num, 1)),
@@ -587,96 +657,6 @@ class _View:
             shN=colors[:, 1:],
             features=features,
         )
-
-    def _leaves(self, values: Mapping[str, np.ndarray]) -> dict[str, list[Float]]:
-        """Upload numbers of the camera, float64: opaque, or each value would be a new kernel."""
-        Float64 = dr.float64_array_t(self.types.Float)
-        return {n: [dr.opaque(Float64, float(x)) for x in each] for n, each in values.items()}
-
-    def _camera(self, leaves: Mapping[str, list[Float]]) -> Camera:
-        """Return the camera, attached to its numbers."""
-        film, t, K = self.film, self.types, leaves["Ks"]
-        axes, step = SHUTTERS[film.shutter]
-        names = ("viewmats", "viewmats_rs")[::step] if "viewmats_rs" in leaves else ("viewmats",)
-        (rotation, center), *end = [self._pose(leaves[name]) for name in names]
-        size, near = film.camera_size, dr.opaque(t.Float, film.near)
-        camera = Camera(
-            rotation=rotation,
-            center=center,
-            focal=t.Array2f([t.Float(K[4 * axis]) for axis in axes]),
-            principal=t.Array2f([t.Float(K[3 * axis + 2]) for axis in axes]),
-            film_start=t.Array2f(dr.opaque(t.Float, 0)),
-            film_end=t.Array2f([dr.opaque(t.Float, side) for side in size]),
-            near=near,
-            width=size[0],
-            height=size[1],
-        ).with_lens(self._lens(leaves))
-        return _read_rows(camera, *end[0]) if end else camera
-
-    def _pose(self, viewmat: Sequence[Float]) -> tuple[Matrix3f, Array3f]:
-        """Return rotation and centre, which is -R^-1 t, of the camera's axes."""
-        t, t64 = self.types, types_of(type(viewmat[0]))
-        rows = [viewmat[4 * axis : 4 * axis + 4] for axis in (*self.film.axes, 2)]
-        rotation = t64.Matrix3f([row[:3] for row in rows])
-        center = -(dr.rcp(rotation) @ t64.Array3f([row[3] for row in rows]))
-        return t.Matrix3f(rotation), t.Array3f(center)
-
-    def _lens(self, leaves: Mapping[str, list[Float]]) -> Lens:
-        model, tangential = self.film.model, [TANGENTIAL[axis] for axis in self.film.axes]
-        if model == "ortho":
-            return Orthographic()
-        names = {"radial_coeffs": RADIAL, "tangential_coeffs": tangential}
-        given = {k: names[k] for k in names.keys() & leaves.keys()}
-        if model == "pinhole" and not given:
-            return PINHOLE
-        kind = ForwardFisheye if model == "fisheye" else RadialTangential
-        host = {n: float(x) for k in given for n, x in zip(given[k], self.host[k], strict=False)}
-        values = {n: x for k in given for n, x in zip(given[k], leaves[k], strict=False)}
-        lens = kind.from_coefficients(**host)
-        return lens.with_coefficients({n: self.types.Float(x) for n, x in values.items()})
-
-    def _camera_gradients(self, d_numbers: list[Float]) -> dict[str, Float]:
-        """Return gradients of the camera's arrays from those of its numbers."""
-        with dr.resume_grad():
-            leaves = self._leaves(self.host)
-            dr.enable_grad(leaves)
-            pairs = zip(self._camera(leaves).numbers(), d_numbers, strict=True)
-            attached = [(number, d) for number, d in pairs if dr.grad_enabled(number)]
-            for number, d in attached:
-                dr.accum_grad(number, d)
-            dr.enqueue(dr.ADMode.Backward, [number for number, _ in attached])
-            dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
-            gradients = {n: [self.types.Float(dr.grad(x)) for x in v] for n, v in leaves.items()}
-        return {name: interleave(each) for name, each in gradients.items()}
-
-    def _camera_tangents(self, directions: Mapping[str, TensorXf]) -> list[Float]:
-        """Return tangents of the camera's numbers from those of its arrays."""
-        along = {name: np.array(directions[name], np.float64).ravel() for name in self.host}
-        with dr.resume_grad():
-            leaves = self._leaves(self.host)
-            dr.enable_grad(leaves)
-            numbers = self._camera(leaves).numbers()
-            dr.set_grad(leaves, self._leaves(along))
-            dr.enqueue(dr.ADMode.Forward, leaves)
-            # Some numbers are inputs of others: the default would clear their derivatives.
-            dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-            tangents = [dr.grad(number) for number in numbers]
-        dr.make_opaque(tangents)
-        return tangents
-
-
-def _read_rows(camera: Camera, rotation: Matrix3f, center: Array3f) -> Camera:
-    """Return the camera with a shutter that reads the last row at the pose given.
-
-    Row i, whose middle is at i + 1/2, is read at i / (height - 1): the film begins half a row
-    before the first pose, and ends half a row after the second.
-    """
-    motion, rows = RollingShutter(*RollingShutter.relative_motion(camera, rotation, center)), camera.height
-    start, scale = (
-        dr.opaque(type(camera.near), x / (rows - 1)) for x in (-0.5, float(rows))
-    )
-    shutter = RollingShutter(motion.travel * scale, motion.turn * scale)
-    return replace(motion.pose(camera, start), shutter=shutter)
 
 
 def _meta(views: list[_View], shape: tuple[int, ...]) -> dict[str, Any]:
