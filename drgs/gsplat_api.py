@@ -26,7 +26,7 @@ from drgs.cameras.orthographic import Orthographic
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.approximations import Approximations
 from drgs.core.arrays import from_host, interleave, quotient, real_numbers, types_of
-from drgs.core.constants import ALPHA_CUT, LOW_PASS, MAX_COEFFICIENT, MAX_FEATURES
+from drgs.core.constants import ALPHA_CUT, LOW_PASS, MAX_FEATURES
 from drgs.core.errors import did_you_mean
 from drgs.core.llvm import ensure_usable_llvm
 from drgs.core.memory import too_large_reason
@@ -47,7 +47,6 @@ Array = Any  # arrays of the caller: numpy arrays, or tensors of Dr.Jit or PyTor
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
-CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
 
 SHUTTERS = {
     "GLOBAL": ((0, 1), 1),
@@ -59,7 +58,15 @@ SHUTTERS = {
 """Axes of the image that a camera has as x and y, and the step from its first pose to the second:
 a shutter of drgs reads rows from the first to the last."""
 
-RADIAL, TANGENTIAL = ("k1", "k2", "k3", "k4", "k5", "k6"), ("p1", "p2")
+LENS_TERMS = {
+    "pinhole": {
+        "radial_coeffs": ("k1", "k2", "k3", "k4", "k5", "k6"),
+        "tangential_coeffs": ("p1", "p2"),
+    },
+    "fisheye": {"radial_coeffs": ("k1", "k2", "k3", "k4")},
+    "ortho": {},
+}
+"""Names of coefficients by camera model and array."""
 
 MIN_ALPHA = 1e-10  # divisor of expected depths, as in gsplat
 MIN_SCALE = 1e-18  # world units: its square is not 0 in float32
@@ -102,6 +109,8 @@ SHAPES: dict[str, list[tuple[str | int, ...]]] = {
 
 CAMERA_ARRAYS = ("viewmats", "Ks", "viewmats_rs", "radial_coeffs", "tangential_coeffs")
 
+OPTIONAL_ARRAYS = ("backgrounds", "viewmats_rs", "radial_coeffs", "tangential_coeffs")
+
 COEFFICIENTS: list[tuple[str | int, ...]] = [("N", "K", 3), ("C", "N", "K", 3)]
 """Shapes of ``colors`` with ``sh_degree``."""
 
@@ -115,12 +124,13 @@ def accept_torch(function: Function) -> Function:
     @wraps(function)
     def wrapped(*args: object, **kwargs: object) -> tuple[Array, Array, dict[str, Any]]:
         bound = signature.bind(*args, **kwargs)
-        given = {name: v for name, v in bound.arguments.items() if _is_torch(v)}
+        given: dict[str, Any] = {n: v for n, v in bound.arguments.items() if _is_torch(v)}
         if not given:
             return function(*args, **kwargs)
-        if "means" not in given:
-            raise TypeError(f"rasterization(): means must be of PyTorch, as {next(iter(given))} is")
-        meta = {}
+        kind, meta = getattr(given.get("means"), "dtype", None), {}
+        if str(kind) not in ("torch.float32", "torch.float64"):
+            expected = f"a tensor of PyTorch, as {next(iter(given))} is, of 32 or 64 bits"
+            raise TypeError(f"rasterization(): means must be {expected}, got {kind or 'another'}")
 
         @dr.wrap(source="torch", target="drjit")
         def differentiable(tensors: dict[str, TensorXf]) -> tuple[TensorXf, TensorXf]:
@@ -130,9 +140,7 @@ def accept_torch(function: Function) -> Function:
             return images, alphas
 
         # Views, as dr.wrap leaves out parameters of modules, which are of a subclass.
-        images, alphas = differentiable(
-            {name: cast(Any, v).view_as(v) for name, v in given.items()}
-        )
+        images, alphas = differentiable({n: v.to(kind).view_as(v) for n, v in given.items()})
         return images, alphas, meta
 
     return cast(Function, wrapped)
@@ -210,7 +218,7 @@ def rasterization(
     shutter = str(getattr(rolling_shutter, "name", rolling_shutter))
     for name, value, choices in (
         ("render_mode", render_mode, RENDER_MODES),
-        ("camera_model", camera_model, CAMERA_MODELS),
+        ("camera_model", camera_model, tuple(LENS_TERMS)),
         ("rolling_shutter", shutter, tuple(SHUTTERS)),
     ):
         _require(value in choices, name, f"one of {choices}", value)
@@ -224,18 +232,18 @@ def rasterization(
     tensor_type = _tensor_type(means)
     if "llvm" in tensor_type.__module__:
         ensure_usable_llvm()
-    given = (means, viewmats, quats, scales, opacities, Ks, colors)
-    optional = (backgrounds, viewmats_rs, radial_coeffs, tangential_coeffs)
+    required = (means, viewmats, quats, scales, opacities, Ks, colors)
+    values = (*required, backgrounds, viewmats_rs, radial_coeffs, tangential_coeffs)
     inputs = {
         name: _tensor(name, value, tensor_type)
-        for name, value in zip(SHAPES, (*given, *optional), strict=True)
-        if not (value is None and name in [*SHAPES][len(given) :])
+        for name, value in zip(SHAPES, values, strict=True)
+        if not (value is None and name in OPTIONAL_ARRAYS)
     }
     batch, by_camera = inputs["means"].shape[:-2], _check_shapes(inputs, sh_degree)
     for name, largest in (("scales", 1e37), ("opacities", 1.0)):
         value = dr.detach(inputs[name].array)
         is_within = dr.all((value >= 0) & (value <= largest))
-        _require(bool(is_within), name, f"numbers from 0 to {largest:g}", "others")
+        _require(is_within, name, f"numbers from 0 to {largest:g}", "others")
     film = _Film(int(width), int(height), float(near_plane), sh_degree, camera_model, shutter)
     _check_cameras(film, {k: np.array(inputs[k], np.float64) for k in CAMERA_ARRAYS if k in inputs})
     color = NamedFeature("colors") if sh_degree is None else color_features
@@ -264,7 +272,7 @@ def rasterization(
     return images.numpy(), alphas.numpy(), meta
 
 
-def _require(holds: bool, name: str, expected: str, got: object) -> None:
+def _require(holds: Any, name: str, expected: str, got: object) -> None:
     if not holds:
         raise ValueError(f"rasterization(): {name} must be {expected}, got {got!r}")
 
@@ -342,7 +350,7 @@ def _check_shapes(inputs: Mapping[str, TensorXf], sh_degree: int | None) -> set[
             and all(isinstance(n, str) or n == m for n, m in zip(shape, value.shape, strict=True))
         ]
         expected = " or ".join(str(shape).replace("'", "") for shape in shapes)
-        _require(bool(fitting), name, f"of shape {expected}", value.shape)
+        _require(fitting, name, f"of shape {expected}", value.shape)
         _require(0 not in value.shape, name, "of one row at least", value.shape)
         letters = allowed[fitting[0]]
         sizes |= zip(letters, value.shape[len(batch) :], strict=True)
@@ -359,25 +367,17 @@ def _check_shapes(inputs: Mapping[str, TensorXf], sh_degree: int | None) -> set[
 def _check_cameras(film: _Film, arrays: Mapping[str, np.ndarray]) -> None:
     """Raise ValueError for arrays that are none of the film's camera."""
     viewmats, ends = arrays["viewmats"], arrays.get("viewmats_rs")
-    radial = arrays.get("radial_coeffs", np.zeros(4 if film.model == "fisheye" else 6))
-    others = {"fisheye": ("tangential_coeffs",), "ortho": ("radial_coeffs", "tangential_coeffs")}
-    for name in others.get(film.model, ()):
-        expected = f"None if camera_model is {film.model}"
-        _require(name not in arrays, name, expected, "coefficients")
-    expected = "k1 to k4, of shape (C, 4), if camera_model is fisheye"
-    _require(
-        film.model != "fisheye" or radial.shape[-1] == 4, "radial_coeffs", expected, radial.shape
-    )
-    for name in ("radial_coeffs", "tangential_coeffs"):
-        is_small = np.all(np.abs(arrays.get(name, 0)) <= MAX_COEFFICIENT)
-        _require(bool(is_small), name, f"numbers of at most {MAX_COEFFICIENT:g} in size", "others")
-    is_rolling, rows = film.shutter != "GLOBAL", film.camera_size[1]
+    for name in arrays.keys() & {*LENS_TERMS["pinhole"]}:
+        terms, shape = LENS_TERMS[film.model].get(name, ()), arrays[name].shape
+        expected = f"{terms[0]} to {terms[-1]}" if terms else "None"
+        expected = f"{expected} if camera_model is {film.model}"
+        _require(shape[-1] <= len(terms), name, expected, f"shape {shape}")
+    is_rolling = film.shutter != "GLOBAL"
     expected = f"{'given' if is_rolling else 'None'} if rolling_shutter is {film.shutter}"
-    _require(
-        is_rolling == (ends is not None), "viewmats_rs", expected, None if ends is None else "it"
-    )
+    _require(is_rolling == (ends is not None), "viewmats_rs", expected, ends)
     expected = f"larger: {film.shutter} reads two rows or columns at least"
-    _require(not is_rolling or rows > 1, "width and height", expected, (film.width, film.height))
+    size = film.width, film.height
+    _require(not is_rolling or film.camera_size[1] > 1, "width and height", expected, size)
     for index in np.ndindex(viewmats.shape[:-2]):
         place, viewmat, K = f"[{', '.join(map(str, index))}]", viewmats[index], arrays["Ks"][index]
         pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
@@ -389,11 +389,12 @@ def _check_cameras(film: _Film, arrays: Mapping[str, np.ndarray]) -> None:
         _require(is_regular, f"viewmats{place}", expected, viewmat.tolist())
         if ends is not None:
             start, end = viewmat[:3, :3], ends[index][:3, :3]
-            shear = max(np.abs(each @ each.T - np.eye(3)).max() for each in (start, end))
-            turns = np.isfinite(ends[index]).all() and np.trace(end @ start.T) > MAX_SHEAR - 1
-            is_turned = turns and shear < MAX_SHEAR and np.linalg.det(end @ start.T) > 0
+            shear = np.abs([each @ each.T - np.eye(3) for each in (start, end)]).max()
+            turn = end @ start.T
+            is_turned = np.linalg.det(turn) > 0 and np.trace(turn) > MAX_SHEAR - 1
             expected = f"rotated by less than half a turn from viewmats{place}, without scale"
-            _require(is_turned, f"viewmats_rs{place}", expected, ends[index].tolist())
+            fits = shear < MAX_SHEAR and is_turned and np.isfinite(ends[index]).all()
+            _require(fits, f"viewmats_rs{place}", expected, ends[index].tolist())
 
 
 def _inputs_of_views(
@@ -426,7 +427,7 @@ def _split(value: TensorXf, num_axes: int) -> list[TensorXf]:
 
 def use_activated(rows: GaussianRows) -> GaussianRows:
     """Use the activated scales and opacities in the features."""
-    assert rows.features is not None, "see _View._gaussians"
+    assert rows.features is not None, "see _View.gaussians_of"
     t = types_of(type(rows.logit_opacities))
     sizes = [dr.abs(scale) for scale in rows.features["scales"]]
     logs = [dr.log(dr.select(size > MIN_SCALE, size, MIN_SCALE)) for size in sizes]
@@ -466,6 +467,7 @@ class _Film:
 
     def camera(self, values: Mapping[str, list[Float]]) -> Camera:
         """Return the camera of arrays, given number by number, attached to them."""
+        dr.eval(values)
         t, K = types_of(type(values["Ks"][0])), values["Ks"]
         axes, step = SHUTTERS[self.shutter]
         names = [name for name in ("viewmats", "viewmats_rs")[::step] if name in values]
@@ -499,13 +501,18 @@ class _Film:
     def _lens(self, values: Mapping[str, list[Float]]) -> Lens:
         if self.model == "ortho":
             return Orthographic()
-        names = {"radial_coeffs": RADIAL, "tangential_coeffs": [TANGENTIAL[k] for k in self.axes]}
-        terms = [each for k in names for each in zip(names[k], values.get(k, ()), strict=False)]
+        terms = {
+            name: value
+            for array, names in LENS_TERMS[self.model].items()
+            for name, value in zip(names, values.get(array, ()), strict=False)
+        }
+        if self.axes == (1, 0) and "p1" in terms:
+            terms |= {"p1": terms["p2"], "p2": terms["p1"]}
         if self.model == "pinhole" and not terms:
             return PINHOLE
         kind = ForwardFisheye if self.model == "fisheye" else RadialTangential
-        lens = kind.from_coefficients(**{name: dr.detach(value)[0] for name, value in terms})
-        return lens.with_coefficients(dict(terms))
+        lens = kind.from_coefficients(**{n: dr.detach(value)[0] for n, value in terms.items()})
+        return lens.with_coefficients(terms)
 
 
 def _numbers(array: TensorXf) -> list[Float]:
@@ -562,19 +569,30 @@ class _Planes(dr.CustomOp):
 
     @override
     def forward(self) -> None:
+        view, d_camera = self.view, None
         d_arrays, d_numbers = (cast(Any, self.grad_in(name)) for name in ("arrays", "numbers"))
-        dr.make_opaque(d_numbers)  # or each value of a literal would be a new kernel
-        self.set_grad_out(self.view.tangents(d_arrays, d_numbers))
+        if view.is_camera_attached:
+            dr.make_opaque(d_numbers)  # or each value of a literal would be a new kernel
+            d_camera = d_numbers
+        d_gaussians = view.gaussians_of(d_arrays)
+        (d_planes,) = frames_tangent(view.gaussians, [view.frame], d_gaussians, d_camera)
+        dr.eval(d_planes)
+        self.set_grad_out(d_planes)
 
     @override
     def backward(self) -> None:
-        gradients, camera = self.view.gradients(cast(Any, self.grad_out()))
-        self.set_grad_in(
-            "arrays",
-            {k: dr.reshape(type(v), gradients[k], v.shape) for k, v in self.arrays.items()},
-        )
-        if camera is not None:
-            self.set_grad_in("numbers", camera)
+        view, d_planes = self.view, cast(list[Float], self.grad_out())
+        dr.eval(d_planes)
+        with_camera = view.is_camera_attached
+        adjoint = frames_adjoint(view.gaussians, [view.frame], [d_planes], with_camera)
+        d = adjoint.parameters
+        assert d.features is not None, "of view.gaussians, projected here"
+        colors = {} if "colors" in d.features else {"colors": d.sh}
+        flat = {"means": d.means, "quats": d.quats, **d.features, **colors}
+        pairs = self.arrays.items()
+        self.set_grad_in("arrays", {k: dr.reshape(type(v), flat[k], v.shape) for k, v in pairs})
+        if adjoint.camera is not None:
+            self.set_grad_in("numbers", adjoint.camera)
 
     @override
     def name(self) -> str:
@@ -600,45 +618,19 @@ class ForwardFisheye(Fisheye):
 
 
 class _View:
-    """Planes of one camera, and their derivatives."""
+    """A rendering by one camera."""
 
     def __init__(
         self, film: _Film, pipeline: Pipeline, camera: Camera, arrays: Mapping[str, TensorXf]
     ) -> None:
         """Render; arrays: detached."""
         self.film = film
-        self.gaussians = self._gaussians(arrays)
+        self.gaussians = self.gaussians_of(arrays)
         self.is_camera_attached, camera = dr.grad_enabled(camera.numbers()), dr.detach(camera)
         self.pipeline = with_effects(pipeline, self.gaussians, camera)
         self.frame = render(self.gaussians, camera, self.pipeline)
 
-    def tangents(self, directions: Mapping[str, TensorXf], d_numbers: list[Float]) -> list[Float]:
-        """Return tangents of the planes from those of the arrays and the camera's numbers."""
-        d_gaussians = self._gaussians(directions)
-        d_camera = d_numbers if self.is_camera_attached else None
-        (d_planes,) = frames_tangent(self.gaussians, [self.frame], d_gaussians, d_camera)
-        dr.eval(d_planes)
-        return d_planes
-
-    def gradients(
-        self, d_planes: list[Float]
-    ) -> tuple[dict[str, TensorXf | Float], list[Float] | None]:
-        """Return gradients of the arrays and of the camera's numbers from those of the planes."""
-        dr.eval(d_planes)
-        with_camera = self.is_camera_attached
-        adjoint = frames_adjoint(self.gaussians, [self.frame], [d_planes], with_camera)
-        d = adjoint.parameters
-        assert d is not None and d.features is not None, "of self.gaussians, projected here"
-        gradients: dict[str, TensorXf | Float] = {
-            "means": d.means,
-            "quats": d.quats,
-            "scales": d.features["scales"],
-            "opacities": d.features["opacities"],
-            "colors": d.features["colors"] if self.film.sh_degree is None else d.sh,
-        }
-        return gradients, adjoint.camera
-
-    def _gaussians(self, values: Mapping[str, TensorXf]) -> Gaussians:
+    def gaussians_of(self, values: Mapping[str, TensorXf]) -> Gaussians:
         """Return values, or tangents, of the Gaussians."""
         num, t = values["means"].shape[0], types_of(type(values["opacities"].array))
         colors = values["colors"]
