@@ -26,11 +26,11 @@ from drgs.cameras.orthographic import Orthographic
 from drgs.cameras.radial_tangential import RadialTangential
 from drgs.config.approximations import Approximations
 from drgs.core.arrays import from_host, interleave, quotient, real_numbers, types_of
-from drgs.core.constants import ALPHA_CUT, LOW_PASS, MAX_FEATURES
+from drgs.core.constants import ALPHA_CUT, LOW_PASS, MAX_COEFFICIENT, MAX_FEATURES
 from drgs.core.errors import did_you_mean
 from drgs.core.llvm import ensure_usable_llvm
 from drgs.core.memory import too_large_reason
-from drgs.core.types import Array3f, Bool, Float, Matrix3f, TensorXf
+from drgs.core.types import Array3f, Bool, Float, Matrix3f, Scalar, TensorXf
 from drgs.effects.compose import NamedFeature, with_effects
 from drgs.gaussians.parameters import Gaussians
 from drgs.splatting.projection import GaussianRows, load_rows
@@ -57,16 +57,6 @@ SHUTTERS = {
 }
 """Axes of the image that a camera has as x and y, and the step from its first pose to the second:
 a shutter of drgs reads rows from the first to the last."""
-
-LENS_TERMS = {
-    "pinhole": {
-        "radial_coeffs": ("k1", "k2", "k3", "k4", "k5", "k6"),
-        "tangential_coeffs": ("p1", "p2"),
-    },
-    "fisheye": {"radial_coeffs": ("k1", "k2", "k3", "k4")},
-    "ortho": {},
-}
-"""Names of coefficients by camera model and array."""
 
 MIN_ALPHA = 1e-10  # divisor of expected depths, as in gsplat
 MIN_SCALE = 1e-18  # world units: its square is not 0 in float32
@@ -107,12 +97,40 @@ SHAPES: dict[str, list[tuple[str | int, ...]]] = {
 }
 """Allowed shapes behind the batch axes; a letter is the same number everywhere."""
 
-CAMERA_ARRAYS = ("viewmats", "Ks", "viewmats_rs", "radial_coeffs", "tangential_coeffs")
+LENS_TERMS = {"radial_coeffs": "k", "tangential_coeffs": "p"}
+"""First letters of coefficients' names, by array."""
 
-OPTIONAL_ARRAYS = ("backgrounds", "viewmats_rs", "radial_coeffs", "tangential_coeffs")
+CAMERA_ARRAYS = ("viewmats", "Ks", "viewmats_rs", *LENS_TERMS)
+OPTIONAL_ARRAYS = ("backgrounds", "viewmats_rs", *LENS_TERMS)
 
 COEFFICIENTS: list[tuple[str | int, ...]] = [("N", "K", 3), ("C", "N", "K", 3)]
 """Shapes of ``colors`` with ``sh_degree``."""
+
+
+@dataclass(frozen=True)
+class ForwardFisheye(Fisheye):
+    """A fisheye as in gsplat: it sees points in front of it, whose depth is z."""
+
+    depth_direction = Perspective.depth_direction
+    ray_range = Perspective.ray_range
+
+    @override
+    def shows(self, position: Array3f) -> Bool:
+        return super().shows(position) & (position.z > 0)
+
+    @override
+    def visibility(
+        self, camera: CameraParameters, position: Array3f
+    ) -> tuple[Bool, Array3f, Float]:
+        return with_unseen_on_axis(position, self.shows(position) & (position.z >= camera.near))
+
+
+LENS_TYPES: dict[str, type[Lens]] = {
+    "pinhole": RadialTangential,
+    "ortho": Orthographic,
+    "fisheye": ForwardFisheye,
+}
+"""Lenses with coefficients, by ``camera_model``."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -124,13 +142,17 @@ def accept_torch(function: Function) -> Function:
     @wraps(function)
     def wrapped(*args: object, **kwargs: object) -> tuple[Array, Array, dict[str, Any]]:
         bound = signature.bind(*args, **kwargs)
-        given: dict[str, Any] = {n: v for n, v in bound.arguments.items() if _is_torch(v)}
+        given: dict[str, Any] = {
+            name: value
+            for name, value in bound.arguments.items()
+            if type(value).__module__.startswith("torch")
+        }
         if not given:
             return function(*args, **kwargs)
         kind, meta = getattr(given.get("means"), "dtype", None), {}
         if str(kind) not in ("torch.float32", "torch.float64"):
             expected = f"a tensor of PyTorch, as {next(iter(given))} is, of 32 or 64 bits"
-            raise TypeError(f"rasterization(): means must be {expected}, got {kind or 'another'}")
+            raise TypeError(f"rasterization(): means must be {expected}, got {kind}")
 
         @dr.wrap(source="torch", target="drjit")
         def differentiable(tensors: dict[str, TensorXf]) -> tuple[TensorXf, TensorXf]:
@@ -144,10 +166,6 @@ def accept_torch(function: Function) -> Function:
         return images, alphas, meta
 
     return cast(Function, wrapped)
-
-
-def _is_torch(value: object) -> bool:
-    return type(value).__module__.partition(".")[0] == "torch" and hasattr(value, "view_as")
 
 
 @accept_torch
@@ -190,18 +208,18 @@ def rasterization(
     near_plane: z in the camera, scene units, below which means are not seen; eps2d: px^2 added to
     the projected covariance; backgrounds: (C, D) behind the splats, None: 0; render_mode: ``RGB``,
     ``D`` (the sum of alpha-weighted depths), ``ED`` (that divided by alpha), ``RGB+D``, ``RGB+ED``;
-    rasterize_mode: ``classic`` or ``antialiased`` (opacities are scaled to keep splats' integrals);
-    approximations: other values of :class:`drgs.config.approximations.Approximations`, such as
-    ``projection="exact"`` or ``order="pixel"``. Parameters of gsplat that drgs does not have may
-    have gsplat's defaults; those of its memory layout, such as ``packed``, any value.
+    rasterize_mode: ``classic`` or ``antialiased`` (opacities are scaled to keep splats' integrals).
 
-    camera_model: ``pinhole``, ``ortho`` (focal lengths in px per scene unit; colours are seen along
-    the axis) or ``fisheye`` (by the angle from the axis; depths are z); radial_coeffs: OpenCV's k1
-    to k4 or, of a pinhole, k6: (C, 4) or (C, 6); tangential_coeffs: p1, p2 of a pinhole, (C, 2);
-    with any projection. rolling_shutter: gsplat's ``RollingShutterType``, or its name, such as
-    ``ROLLING_TOP_TO_BOTTOM``; the first row is then read at ``viewmats``, the last at
-    ``viewmats_rs`` (C, 4, 4). Between them the camera turns evenly, and its centre, not gsplat's
-    translation of the matrices, moves on a line.
+    camera_model: ``pinhole``, ``ortho`` (fx, fy in px per scene unit; colours are seen along the
+    axis) or ``fisheye``; radial_coeffs, tangential_coeffs: OpenCV's k1 to k4 or k6 and p1, p2 of a
+    pinhole, (C, 4 or 6) and (C, 2), k1 to k4 of a fisheye; rolling_shutter: gsplat's
+    ``RollingShutterType`` or its name, such as ``ROLLING_TOP_TO_BOTTOM``: the first row is read at
+    ``viewmats``, the last at ``viewmats_rs``, (C, 4, 4). Between them the camera turns evenly, and
+    its centre (not the matrix's translation, as in gsplat) moves on a line.
+
+    approximations: other values of :class:`drgs.config.approximations.Approximations`, such as
+    ``projection="exact"`` or ``order="pixel"``. gsplat's ``packed``, ``tile_size``, ``segmented``
+    and ``channel_chunk`` change nothing; its other parameters may have their defaults.
 
     Returns images (C, H, W, X), X = D, 1 or D + 1 with the depth last; alphas (C, H, W, 1); and a
     dictionary with ``means2d`` (C, N, 2) px, ``depths`` (C, N), ``conics`` (C, N, 3), the numbers
@@ -218,7 +236,7 @@ def rasterization(
     shutter = str(getattr(rolling_shutter, "name", rolling_shutter))
     for name, value, choices in (
         ("render_mode", render_mode, RENDER_MODES),
-        ("camera_model", camera_model, tuple(LENS_TERMS)),
+        ("camera_model", camera_model, tuple(LENS_TYPES)),
         ("rolling_shutter", shutter, tuple(SHUTTERS)),
     ):
         _require(value in choices, name, f"one of {choices}", value)
@@ -239,7 +257,7 @@ def rasterization(
         for name, value in zip(SHAPES, values, strict=True)
         if not (value is None and name in OPTIONAL_ARRAYS)
     }
-    batch, by_camera = inputs["means"].shape[:-2], _check_shapes(inputs, sh_degree)
+    by_camera = _check_shapes(inputs, sh_degree)
     for name, largest in (("scales", 1e37), ("opacities", 1.0)):
         value = dr.detach(inputs[name].array)
         is_within = dr.all((value >= 0) & (value <= largest))
@@ -251,7 +269,7 @@ def rasterization(
     features += () if render_mode == "RGB" else (depth_feature,)
     pipeline = replace(pipeline_of(selected, sh_degree or 0, features), rows=use_activated)
     views, pixels = [], []
-    for values in _inputs_of_views(inputs, len(batch), by_camera):
+    for values in _inputs_of_views(inputs, by_camera):
         background = values.pop("backgrounds", None)
         arrays = {name: values.pop(name) for name in CAMERA_ARRAYS if name in values}
         camera = film.camera({name: _numbers(array) for name, array in arrays.items()})
@@ -260,7 +278,7 @@ def rasterization(
         planes = dr.custom(_Planes, views[-1], values, camera.numbers())
         pixels.append(_image(film.in_rows(planes), background, render_mode))
     dr.eval(pixels)
-    shape = (*batch, len(views) // max(math.prod(batch), 1))
+    shape = inputs["viewmats"].shape[:-2]
     images, alphas = (
         _stack_views([each[k] for each in pixels], (*shape, film.height, film.width))
         for k in (0, 1)
@@ -308,12 +326,11 @@ def _approximations(
 
 def _tensor_type(means: Array) -> type[TensorXf]:
     """Return the type of all tensors: that of ``means``."""
-    if dr.is_array_v(means) and dr.is_tensor_v(means) and dr.is_float_v(means):
-        return cast(type[TensorXf], type(means))
     if dr.is_array_v(means):
-        raise TypeError(
-            f"rasterization(): means must be a tensor (N, 3) of floats, got {type(means).__name__}"
-        )
+        if dr.is_tensor_v(means) and dr.type_v(means) in (dr.VarType.Float32, dr.VarType.Float64):
+            return cast(type[TensorXf], type(means))
+        expected, kind = "a tensor (N, 3) of floats of 32 or 64 bits", type(means).__name__
+        raise TypeError(f"rasterization(): means must be {expected}, got {kind}")
     from drjit import llvm
 
     is_double = real_numbers("rasterization()", "means", means).dtype == np.float64
@@ -367,17 +384,16 @@ def _check_shapes(inputs: Mapping[str, TensorXf], sh_degree: int | None) -> set[
 def _check_cameras(film: _Film, arrays: Mapping[str, np.ndarray]) -> None:
     """Raise ValueError for arrays that are none of the film's camera."""
     viewmats, ends = arrays["viewmats"], arrays.get("viewmats_rs")
-    for name in arrays.keys() & {*LENS_TERMS["pinhole"]}:
-        terms, shape = LENS_TERMS[film.model].get(name, ()), arrays[name].shape
+    for name in arrays.keys() & LENS_TERMS.keys():
+        terms, values = film.lens_terms(name), arrays[name]
         expected = f"{terms[0]} to {terms[-1]}" if terms else "None"
         expected = f"{expected} if camera_model is {film.model}"
-        _require(shape[-1] <= len(terms), name, expected, f"shape {shape}")
+        _require(values.shape[-1] <= len(terms), name, expected, f"shape {values.shape}")
+        expected = f"numbers of at most {MAX_COEFFICIENT:g} in size"
+        _require(np.abs(values).max() <= MAX_COEFFICIENT, name, expected, "others")
     is_rolling = film.shutter != "GLOBAL"
     expected = f"{'given' if is_rolling else 'None'} if rolling_shutter is {film.shutter}"
     _require(is_rolling == (ends is not None), "viewmats_rs", expected, ends)
-    expected = f"larger: {film.shutter} reads two rows or columns at least"
-    size = film.width, film.height
-    _require(not is_rolling or film.camera_size[1] > 1, "width and height", expected, size)
     for index in np.ndindex(viewmats.shape[:-2]):
         place, viewmat, K = f"[{', '.join(map(str, index))}]", viewmats[index], arrays["Ks"][index]
         pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
@@ -398,11 +414,11 @@ def _check_cameras(film: _Film, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _inputs_of_views(
-    inputs: Mapping[str, TensorXf], num_batch_axes: int, by_camera: set[str]
+    inputs: Mapping[str, TensorXf], by_camera: set[str]
 ) -> list[dict[str, TensorXf]]:
     """Return the inputs of each view, attached, without batch and camera axes."""
-    num_cameras = inputs["viewmats"].shape[num_batch_axes]
-    parts = {k: _split(v, num_batch_axes + (k in by_camera)) for k, v in inputs.items()}
+    *batch, num_cameras, _, _ = inputs["viewmats"].shape
+    parts = {k: _split(v, len(batch) + (k in by_camera)) for k, v in inputs.items()}
     dr.eval(parts)
     return [
         {k: v[view if k in by_camera else view // num_cameras] for k, v in parts.items()}
@@ -455,6 +471,11 @@ class _Film:
         x, y = self.axes
         return (self.width, self.height)[x], (self.width, self.height)[y]
 
+    def lens_terms(self, array: str) -> list[str]:
+        """Return the names of an array's coefficients."""
+        names, first = LENS_TYPES[self.model].coefficient_names(), LENS_TERMS[array]
+        return [name for name in names if name.startswith(first)]
+
     def in_rows(self, planes: list[Float]) -> list[Float]:
         """Return planes of the camera in the order of the image's pixels."""
         if self.axes == (0, 1):
@@ -499,20 +520,15 @@ class _Film:
         return t.Matrix3f(rotation), t.Array3f(center)
 
     def _lens(self, values: Mapping[str, list[Float]]) -> Lens:
-        if self.model == "ortho":
-            return Orthographic()
-        terms = {
-            name: value
-            for array, names in LENS_TERMS[self.model].items()
-            for name, value in zip(names, values.get(array, ()), strict=False)
-        }
-        if self.axes == (1, 0) and "p1" in terms:
-            terms |= {"p1": terms["p2"], "p2": terms["p1"]}
+        terms: dict[str, Scalar] = {}
+        for array in LENS_TERMS.keys() & values.keys():
+            terms |= zip(self.lens_terms(array), values[array], strict=False)
         if self.model == "pinhole" and not terms:
             return PINHOLE
-        kind = ForwardFisheye if self.model == "fisheye" else RadialTangential
-        lens = kind.from_coefficients(**{n: dr.detach(value)[0] for n, value in terms.items()})
-        return lens.with_coefficients(terms)
+        if self.axes == (1, 0) and "p1" in terms:
+            terms |= {"p1": terms["p2"], "p2": terms["p1"]}
+        host = {name: dr.detach(value)[0] for name, value in terms.items()}
+        return LENS_TYPES[self.model].from_coefficients(**host).with_coefficients(terms)
 
 
 def _numbers(array: TensorXf) -> list[Float]:
@@ -530,8 +546,9 @@ def _read_rows(camera: Camera, rotation: Matrix3f, center: Array3f) -> Camera:
     before the first pose, and ends half a row after the second.
     """
     motion = RollingShutter(*RollingShutter.relative_motion(camera, rotation, center))
-    rows, between = float(camera.height), camera.height - 1
-    start, scale = (dr.opaque(type(camera.near), x / between) for x in (-0.5, rows))
+    per_row = 1 / max(camera.height - 1, 1)
+    numbers = (-0.5 * per_row, camera.height * per_row)
+    start, scale = (dr.opaque(type(camera.near), number) for number in numbers)
     shutter = RollingShutter(motion.travel * scale, motion.turn * scale)
     return replace(motion.pose(camera, start), shutter=shutter)
 
@@ -597,24 +614,6 @@ class _Planes(dr.CustomOp):
     @override
     def name(self) -> str:
         return "rasterization"
-
-
-@dataclass(frozen=True)
-class ForwardFisheye(Fisheye):
-    """A fisheye as in gsplat: it sees points in front of it, whose depth is z."""
-
-    depth_direction = Perspective.depth_direction
-    ray_range = Perspective.ray_range
-
-    @override
-    def shows(self, position: Array3f) -> Bool:
-        return super().shows(position) & (position.z > 0)
-
-    @override
-    def visibility(
-        self, camera: CameraParameters, position: Array3f
-    ) -> tuple[Bool, Array3f, Float]:
-        return with_unseen_on_axis(position, self.shows(position) & (position.z >= camera.near))
 
 
 class _View:
