@@ -71,10 +71,7 @@ GSPLAT_REMEDIES: dict[str, tuple[object, str]] = {
     "with_eval3d": (False, 'give projection="exact"'),
     "absgrad distributed sparse_grad": (False, "leave it out"),
     "radius_clip": (0, "leave it out"),
-    "thin_prism_coeffs ftheta_coeffs": (
-        None,
-        "leave it out; mi.render takes other lenses, by the sensor calibrated",
-    ),
+    "thin_prism_coeffs ftheta_coeffs": (None, "give mi.render a sensor of type calibrated"),
 }
 """gsplat's default, the only value allowed, and remedies for others, by the parameters of gsplat,
 separated by spaces, that drgs does not have."""
@@ -125,11 +122,7 @@ class ForwardFisheye(Fisheye):
         return with_unseen_on_axis(position, self.shows(position) & (position.z >= camera.near))
 
 
-LENS_TYPES: dict[str, type[Lens]] = {
-    "pinhole": RadialTangential,
-    "ortho": Orthographic,
-    "fisheye": ForwardFisheye,
-}
+LENS_TYPES = {"pinhole": RadialTangential, "ortho": Orthographic, "fisheye": ForwardFisheye}
 """Lenses with coefficients, by ``camera_model``."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -142,11 +135,7 @@ def accept_torch(function: Function) -> Function:
     @wraps(function)
     def wrapped(*args: object, **kwargs: object) -> tuple[Array, Array, dict[str, Any]]:
         bound = signature.bind(*args, **kwargs)
-        given: dict[str, Any] = {
-            name: value
-            for name, value in bound.arguments.items()
-            if type(value).__module__.startswith("torch")
-        }
+        given = {n: v for n, v in bound.arguments.items() if type(v).__module__[:5] == "torch"}
         if not given:
             return function(*args, **kwargs)
         kind, meta = getattr(given.get("means"), "dtype", None), {}
@@ -279,10 +268,8 @@ def rasterization(
         pixels.append(_image(film.in_rows(planes), background, render_mode))
     dr.eval(pixels)
     shape = inputs["viewmats"].shape[:-2]
-    images, alphas = (
-        _stack_views([each[k] for each in pixels], (*shape, film.height, film.width))
-        for k in (0, 1)
-    )
+    size = (*shape, film.height, film.width)
+    images, alphas = (_stack_views(list(parts), size) for parts in zip(*pixels, strict=True))
     meta = _meta(views, shape)
     if dr.is_array_v(means):
         return images, alphas, meta
@@ -384,8 +371,8 @@ def _check_shapes(inputs: Mapping[str, TensorXf], sh_degree: int | None) -> set[
 def _check_cameras(film: _Film, arrays: Mapping[str, np.ndarray]) -> None:
     """Raise ValueError for arrays that are none of the film's camera."""
     viewmats, ends = arrays["viewmats"], arrays.get("viewmats_rs")
-    for name in arrays.keys() & LENS_TERMS.keys():
-        terms, values = film.lens_terms(name), arrays[name]
+    for name, values in ((name, arrays[name]) for name in LENS_TERMS if name in arrays):
+        terms = film.lens_terms(name)
         expected = f"{terms[0]} to {terms[-1]}" if terms else "None"
         expected = f"{expected} if camera_model is {film.model}"
         _require(values.shape[-1] <= len(terms), name, expected, f"shape {values.shape}")
@@ -453,23 +440,19 @@ def use_activated(rows: GaussianRows) -> GaussianRows:
 
 @dataclass(frozen=True)
 class _Film:
+    """Settings that all views share, and cameras with them."""
+
     width: int
     height: int
     near: float
     sh_degree: int | None  # None: colours are given
-    model: str
-    shutter: str
+    model: str  # camera_model
+    shutter: str  # a key of SHUTTERS
 
     @property
     def axes(self) -> tuple[int, int]:
         """Axes of the image that the camera has as x and y."""
         return SHUTTERS[self.shutter][0]
-
-    @property
-    def camera_size(self) -> tuple[int, int]:
-        """Width and height of the camera, px."""
-        x, y = self.axes
-        return (self.width, self.height)[x], (self.width, self.height)[y]
 
     def lens_terms(self, array: str) -> list[str]:
         """Return the names of an array's coefficients."""
@@ -488,12 +471,11 @@ class _Film:
 
     def camera(self, values: Mapping[str, list[Float]]) -> Camera:
         """Return the camera of arrays, given number by number, attached to them."""
-        dr.eval(values)
         t, K = types_of(type(values["Ks"][0])), values["Ks"]
         axes, step = SHUTTERS[self.shutter]
         names = [name for name in ("viewmats", "viewmats_rs")[::step] if name in values]
         (rotation, center), *end = [self._pose(values[name]) for name in names]
-        width, height = self.camera_size
+        width, height = ((self.width, self.height)[axis] for axis in axes)
         camera = Camera(
             rotation=rotation,
             center=center,
@@ -521,13 +503,14 @@ class _Film:
 
     def _lens(self, values: Mapping[str, list[Float]]) -> Lens:
         terms: dict[str, Scalar] = {}
-        for array in LENS_TERMS.keys() & values.keys():
-            terms |= zip(self.lens_terms(array), values[array], strict=False)
+        for array in LENS_TERMS:
+            terms |= zip(self.lens_terms(array), values.get(array, ()), strict=False)
+        dr.eval(terms)
         if self.model == "pinhole" and not terms:
             return PINHOLE
         if self.axes == (1, 0) and "p1" in terms:
             terms |= {"p1": terms["p2"], "p2": terms["p1"]}
-        host = {name: dr.detach(value)[0] for name, value in terms.items()}
+        host = {name: cast(Float, dr.detach(value))[0] for name, value in terms.items()}
         return LENS_TYPES[self.model].from_coefficients(**host).with_coefficients(terms)
 
 
