@@ -133,7 +133,7 @@ def accept_torch(function: Function) -> Function:
     signature = inspect.signature(function)
 
     @wraps(function)
-    def wrapped(*args: object, **kwargs: object) -> tuple[Array, Array, dict[str, Any]]:
+    def call(*args: object, **kwargs: object) -> tuple[Array, Array, dict[str, Any]]:
         bound = signature.bind(*args, **kwargs)
         given = {n: v for n, v in bound.arguments.items() if type(v).__module__[:5] == "torch"}
         if not given:
@@ -154,7 +154,7 @@ def accept_torch(function: Function) -> Function:
         images, alphas = differentiable({n: v.to(kind).view_as(v) for n, v in given.items()})
         return images, alphas, meta
 
-    return cast(Function, wrapped)
+    return cast(Function, call)
 
 
 @accept_torch

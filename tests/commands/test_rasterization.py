@@ -472,7 +472,7 @@ def test_extreme_values_have_finite_gradients():
 
 @pytest.mark.parametrize("name", ["coefficients", "opencv"])
 def test_torch_computes_gradients(name):
-    """Those of Dr.Jit, also by parameters of a module and in a batch."""
+    """They equal those of Dr.Jit, also for parameters of a module and in a batch."""
     torch = pytest.importorskip("torch")
     arrays = {k: np.asarray(v, np.float32) for k, v in arguments(name).items()}
     leaves = {k: torch.nn.Parameter(torch.tensor(v[None])) for k, v in arrays.items()}
