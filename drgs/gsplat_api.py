@@ -290,8 +290,9 @@ def _approximations(
     _require(sh_degree in (None, 0, 1, 2, 3), "sh_degree", "None or 0 to 3", sh_degree)
     known = {f.name for f in fields(Approximations)} - {"low_pass", "antialiased"}
     remedies = {n: each for names, each in GSPLAT_REMEDIES.items() for n in names.split()}
+    names = {*known, *inspect.signature(rasterization).parameters}
     for name in others.keys() - known - MEMORY_LAYOUT:
-        reason = f"there is no parameter {name}{did_you_mean(name, known)}"
+        reason = f"there is no parameter {name}{did_you_mean(name, names)}"
         if name in remedies:
             default, remedy = remedies[name]
             if others[name] is default or (isinstance(default, Real) and others[name] == default):
@@ -375,12 +376,17 @@ def _check_cameras(film: _Film, arrays: Mapping[str, np.ndarray]) -> None:
         terms = film.lens_terms(name)
         expected = f"{terms[0]} to {terms[-1]}" if terms else "None"
         expected = f"{expected} if camera_model is {film.model}"
-        _require(values.shape[-1] <= len(terms), name, expected, f"shape {values.shape}")
+        _require(values.shape[-1] <= len(terms), name, expected, values.shape)
         expected = f"numbers of at most {MAX_COEFFICIENT:g} in size"
         _require(np.abs(values).max() <= MAX_COEFFICIENT, name, expected, "others")
     is_rolling = film.shutter != "GLOBAL"
     expected = f"{'given' if is_rolling else 'None'} if rolling_shutter is {film.shutter}"
-    _require(is_rolling == (ends is not None), "viewmats_rs", expected, ends)
+    _require(
+        is_rolling == (ends is not None),
+        "viewmats_rs",
+        expected,
+        ends if ends is None else ends.shape,
+    )
     for index in np.ndindex(viewmats.shape[:-2]):
         place, viewmat, K = f"[{', '.join(map(str, index))}]", viewmats[index], arrays["Ks"][index]
         pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])

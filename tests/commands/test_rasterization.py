@@ -558,13 +558,14 @@ REFUSED = [
     ({"radius_clip": 2.0}, "radius_clip is a parameter of gsplat's .*; leave it out"),
     ({"with_ut": True}, 'with_ut is .*; give projection="unscented"'),
     ({"projektion": "ewa"}, "no parameter projektion; did you mean projection"),
+    ({"camera_modell": "ortho"}, "no parameter camera_modell; did you mean camera_model"),
     ({**FLAT, "sh_direction": "pixel"}, "sh_direction is of spherical harmonics; give sh_degree"),
 ]
 
 
 @pytest.mark.parametrize(("changes", "message"), REFUSED)
 def test_mismatched_arguments_are_refused_by_name(changes, message):
-    names = {"radius_clip", "with_ut", "projektion"} & set(changes)
+    names = {"radius_clip", "with_ut", "projektion", "camera_modell"} & set(changes)
     error = TypeError if names or "32 or 64" in message else ValueError
     with pytest.raises(error, match=rf"rasterization\(\): .*{message}"):
         drgs.rasterization(**{**scene(), **FILM, "sh_degree": 3, **changes})
