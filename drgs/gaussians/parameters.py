@@ -223,6 +223,8 @@ class Gaussians(Generic[Tensor]):
     @property
     def sh(self) -> Tensor:
         """(N, K, 3) coefficients of all degrees, display space; K = (sh_degree + 1)^2."""
+        if self.shN.shape[1] == 0:  # which dr.concat does not take
+            return self.sh0
         concat = np.concatenate if isinstance(self.sh0, np.ndarray) else dr.concat
         return cast("Callable[..., Tensor]", concat)((self.sh0, self.shN), axis=1)
 

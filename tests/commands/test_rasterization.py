@@ -1,12 +1,15 @@
 """``drgs.rasterization`` against the float64 reference and central differences."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
+from types import SimpleNamespace
 
 import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from support import lenses
 from support.helpers import Case, bitwise, clear
 from support.kernels import float_reductions, kernels_of
 
@@ -91,6 +94,176 @@ def test_images_equal_the_reference(mode):
     assert (meta["width"], meta["height"], meta["n_cameras"]) == (CASE.width, CASE.height, 2)
 
 
+SIX, FOUR, TWO = (np.array([0.03, -0.02, 0.01, 0.05, 0.02, -0.01])[:n] for n in (6, 4, 2))
+RADIAL, TANGENTIAL = {"radial_coeffs": SIX}, {"tangential_coeffs": TWO}
+FISHEYE, ORTHO = {"camera_model": "fisheye"}, {"camera_model": "ortho"}
+GSPLAT_DEFAULTS = {
+    **{"packed": True, "tile_size": 16, "sparse_grad": False, "absgrad": False, "far_plane": 1e10},
+    **{"channel_chunk": 32, "segmented": False, "radius_clip": 0.0, "distributed": False},
+    **{"covars": None, "with_ut": False, "with_eval3d": False, "thin_prism_coeffs": None},
+}
+# Number of cameras, axes of the colours before and behind that of the Gaussians, channels, options.
+CALLS = {
+    "colours": (1, "", (3,), 3, GSPLAT_DEFAULTS),
+    "depths": (2, "", (3,), 1, {"render_mode": "D"}),
+    "expected depths": (2, "", (3,), 1, {"render_mode": "ED"}),
+    "five channels of each camera": (2, "C", (5,), 6, {"render_mode": "RGB+D"}),
+    "coefficients": (3, "", (4, 3), 4, {"sh_degree": 1, "render_mode": "RGB+ED"}),
+    "constants of each camera": (2, "C", (1, 3), 3, {"sh_degree": 0}),
+    "antialiased": (2, "C", (16, 3), 3, {"sh_degree": 2, "rasterize_mode": "antialiased"}),
+    "opencv": (2, "", (3,), 3, RADIAL | TANGENTIAL),
+    "fisheye": (2, "", (2,), 3, {**FISHEYE, "radial_coeffs": FOUR, "render_mode": "RGB+D"}),
+    "ortho": (2, "", (2,), 2, {**ORTHO, "rolling_shutter": "ROLLING_LEFT_TO_RIGHT"}),
+    "exact": (2, "", (3,), 3, {"projection": "exact", "rolling_shutter": "ROLLING_BOTTOM_TO_TOP"}),
+}  # fmt: skip
+
+
+def call_of(name, batch):
+    """Arrays by name, those with a camera axis, and options."""
+    count, by_camera, tail, _, options = CALLS[name]
+    rng, num, lead = np.random.default_rng(7), 6, (*batch, count)
+    arrays = {
+        "means": rng.normal([0, 0, 3], 0.4, (*batch, num, 3)),
+        "quats": rng.normal(size=(*batch, num, 4)),
+        "scales": rng.uniform(0.1, 0.4, (*batch, num, 3)),
+        "opacities": rng.uniform(0.2, 0.9, (*batch, num)),
+        "colors": rng.uniform(size=(*batch, *(lead[-1:] if by_camera else ()), num, *tail)),
+        "viewmats": np.tile(np.eye(4), (*lead, 1, 1)),
+        "Ks": np.tile([[7.0, 0, 3], [0, 8, 2], [0, 0, 1]], (*lead, 1, 1)),
+        "backgrounds": rng.uniform(size=(*lead, tail[-1])),
+    }
+    arrays["viewmats"][..., :3, 3] = rng.normal(0, 0.1, (*lead, 3))
+    if "rolling_shutter" in options:
+        arrays["viewmats_rs"] = arrays["viewmats"].copy()
+        arrays["viewmats_rs"][..., :3, 3] += 0.05
+    for key in [key for key in options if key in ("radial_coeffs", "tangential_coeffs")]:
+        arrays[key] = options[key] * rng.uniform(0.5, 1, (*lead, 1))
+    of_cameras = {"viewmats", "viewmats_rs", "Ks", "backgrounds", "radial_coeffs"}
+    of_cameras |= {"tangential_coeffs"} | ({"colors"} if by_camera else set())
+    options = {k: v for k, v in options.items() if k not in arrays}
+    return {k: v.astype(np.float32) for k, v in arrays.items()}, of_cameras, options
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (1, 2)])
+@pytest.mark.parametrize("name", CALLS)
+def test_results_have_gsplats_shapes_and_equal_calls_for_each_image(name, batch):
+    arrays, of_cameras, options = call_of(name, batch)
+    options = {"width": 7, "height": 5, **options}
+    images, alphas, meta = drgs.rasterization(**arrays, **options)
+    count, _, _, channels, _ = CALLS[name]
+    lead, num = (*batch, count), arrays["means"].shape[-2]
+    tails = {"means2d": (2,), "conics": (3,), "radii": (2,), "depths": (), "opacities": ()}
+    assert images.shape == (*lead, 5, 7, channels) and alphas.shape == (*lead, 5, 7, 1)
+    assert {k: meta[k].shape for k in tails} == {k: (*lead, num, *v) for k, v in tails.items()}
+    numbers = {"width": 7, "height": 5, "n_cameras": count, "n_batches": int(np.prod(batch))}
+    assert numbers.items() <= meta.items() and alphas.any()
+    for *entry, camera in np.ndindex(*lead):
+        one = {k: v[tuple(entry)] for k, v in arrays.items()}
+        one = {k: v[camera : camera + 1] if k in of_cameras else v for k, v in one.items()}
+        image, alpha, values = drgs.rasterization(**one, **options)
+        place = (*entry, camera)
+        np.testing.assert_array_equal(images[place], image[0])
+        np.testing.assert_array_equal(alphas[place], alpha[0])
+        for key in tails:
+            np.testing.assert_array_equal(meta[key][place], values[key][0], key)
+
+
+class ForwardFisheye(lenses.Fisheye):
+    """gsplat's: depths are z."""
+
+    depths = lenses.Lens.depths
+
+    def is_seen(self, camera, points):
+        return super().is_seen(camera, points) & (points[:, 2] >= camera.near)
+
+
+TURN, TRAVEL = np.array([0.012, -0.008, 0.02]), np.array([0.016, -0.024, 0.012])
+
+
+def moved(rotation, center, time):
+    """Poses (N, 3, 3) and (N, 3) at times (N,) from 0 to 1."""
+    turn = Rotation.from_rotvec(time[:, None] * TURN).as_matrix()
+    return turn @ rotation, center + time[:, None] * TRAVEL
+
+
+@dataclass(frozen=True)
+class Rolling(lenses.Lens):
+    """Rows or columns read one after the other; times by iteration, a step takes a tenth."""
+
+    lens: lenses.Lens
+    axis: int
+    step: int
+
+    def own_points(self, camera, points):
+        world, time = points @ camera.rotation + camera.center, np.full(len(points), 0.5)
+        for _ in range(20):
+            rotation, center = moved(camera.rotation, camera.center, time)
+            own = np.einsum("nij,nj->ni", rotation, world - center)
+            place = self.lens.film_points(camera, own)[:, self.axis]
+            time = (place - 0.5) / (camera.size[self.axis] - 1)
+            time = time if self.step == 1 else 1 - time
+        return own
+
+    def film_points(self, camera, points):
+        return self.lens.film_points(camera, self.own_points(camera, points))
+
+    def depths(self, camera, points):
+        return self.own_points(camera, points)[:, 2]
+
+
+OPENCV = lenses.OpenCV(*SIX, *TWO)
+CAMERAS = {
+    "opencv": (RADIAL | TANGENTIAL, OPENCV),
+    "four coefficients": ({"radial_coeffs": FOUR}, lenses.OpenCV(*FOUR)),
+    "tangential": (TANGENTIAL, lenses.OpenCV(p1=TWO[0], p2=TWO[1])),
+    "ortho": (ORTHO, lenses.Orthographic()),
+    "fisheye": (FISHEYE, ForwardFisheye()),
+    "fisheye with coefficients": ({**FISHEYE, "radial_coeffs": FOUR}, ForwardFisheye(*FOUR)),
+    "ROLLING_TOP_TO_BOTTOM": ({}, Rolling(lenses.Pinhole(), 1, 1)),
+    "ROLLING_BOTTOM_TO_TOP": (FISHEYE, Rolling(ForwardFisheye(), 1, -1)),
+    "ROLLING_LEFT_TO_RIGHT": (ORTHO, Rolling(lenses.Orthographic(), 0, 1)),
+    "ROLLING_RIGHT_TO_LEFT": (RADIAL | TANGENTIAL, Rolling(OPENCV, 0, -1)),
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_cameras_project_as_their_equations(name):
+    """The low-pass filter is negligible, as a rolling shutter shears it with the splats."""
+    options, lens = CAMERAS[name]
+    rotation = Rotation.from_matrix(clear(CASE).camera.rotation).as_matrix()  # not of 32 bits
+    camera = replace(clear(CASE).camera, rotation=rotation)
+    if options is ORTHO:
+        camera = replace(camera, fx=0.4 * camera.fx, fy=0.4 * camera.fy)
+    # Without those that are behind the camera or far beside the film.
+    gaussians = reference.Gaussians(**{k: v[8:] for k, v in vars(clear(CASE).gaussians).items()})
+    options = {k: v[None] if isinstance(v, np.ndarray) else v for k, v in options.items()}
+    viewmats = np.tile(np.eye(4), (2, 1, 1))
+    for viewmat, time in zip(viewmats, (0.0, 1.0), strict=True):
+        (viewmat[:3, :3],), (center,) = moved(rotation, camera.center, np.array([time]))
+        viewmat[:3, 3] = -viewmat[:3, :3] @ center
+    if name.startswith("ROLLING"):
+        options |= {"rolling_shutter": name, "viewmats_rs": viewmats[1:]}
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    colors = np.random.default_rng(5).uniform(size=(len(gaussians.means), 3))
+    images, alphas, meta = drgs.rasterization(
+        gaussians.means, gaussians.quats, np.exp(gaussians.log_scales),
+        reference.sigmoid(gaussians.logit_opacities), colors, viewmats[:1], K[None], **FILM,
+        eps2d=1e-8, render_mode="RGB+D", **options,
+    )  # fmt: skip
+    splats = lenses.project(gaussians, camera, lens, low_pass=1e-8)
+    expected = reference.composite(splats, colors, np.zeros(3), CASE.width, CASE.height)
+    assert splats.visible.sum() > 10 and expected.alpha.mean() > 0.2
+    assert not expected.near_threshold.any()
+    found = images[0, ..., :3], images[0, ..., 3], alphas[0, ..., 0]
+    for a, b in zip(found, (expected.image, expected.depth, expected.alpha), strict=True):
+        # Differences of order 8, and a rolling shutter's three steps of Newton's method.
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-8)
+    means2d, conics = meta["means2d"][0], meta["conics"][0]
+    np.testing.assert_allclose(means2d[splats.visible], splats.means2d[splats.visible], rtol=1e-8)
+    conics = conics[splats.visible] / splats.conics[splats.visible][:, [0, 0, 1], [0, 1, 1]]
+    np.testing.assert_allclose(conics, 1, rtol=0, atol=1e-5)  # cancels in the reference
+
+
 def test_colors_of_any_number_of_channels_are_composited():
     """They equal spherical harmonics of degree 0 with these colours."""
     arrays = scene()
@@ -104,12 +277,6 @@ def test_colors_of_any_number_of_channels_are_composited():
     np.testing.assert_allclose(images[..., :3], expected, rtol=0, atol=1e-12)
     np.testing.assert_allclose(images[..., :2:-1], expected, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(alphas, expected_alphas)
-
-    for_each = np.stack([many, 2 * many])
-    twice, _, _ = drgs.rasterization(**{**arrays, "colors": for_each}, **FILM)
-    np.testing.assert_array_equal(twice[0], images[0])
-    missing = (1 - alphas[1]) * backgrounds[1]
-    np.testing.assert_allclose(twice[1] - missing, 2 * (images[1] - missing), atol=1e-12)
 
 
 def many_channels(kind, channels):
@@ -175,12 +342,29 @@ SETTINGS = {
     "colors": {"render_mode": "RGB+D"},
     "colors of each camera": {},
     "depths": {"render_mode": "D"},
+    "opencv": {"rolling_shutter": "ROLLING_RIGHT_TO_LEFT", "render_mode": "RGB+D"},
+    "fisheye": {"camera_model": "fisheye", "rolling_shutter": "ROLLING_TOP_TO_BOTTOM"},
+    "ortho": {"camera_model": "ortho", "projection": "unscented"},
+    "batch of constants": {"sh_degree": 0},
 }
 
 
 def arguments(name):
     arrays = dict(scene())
-    if name in ("colors", "depths"):
+    if name in ("opencv", "fisheye"):
+        arrays["radial_coeffs"] = np.tile(SIX if name == "opencv" else FOUR, (2, 1))
+        turns, centers = moved(arrays["viewmats"][:, :3, :3], np.zeros(3), np.ones(2))
+        arrays["viewmats_rs"] = arrays["viewmats"].copy()
+        arrays["viewmats_rs"][:, :3, :3] = turns
+        arrays["viewmats_rs"][:, :3, 3] += centers
+    if name == "opencv":
+        arrays["tangential_coeffs"] = np.tile(TWO, (2, 1))
+    if name == "ortho":
+        arrays["Ks"] = arrays["Ks"] * [0.4, 0.4, 1]
+    if name == "batch of constants":
+        arrays["colors"] = arrays["colors"][:, :1]
+        arrays = {k: np.stack([v, 0.5 * v if k == "colors" else v]) for k, v in arrays.items()}
+    elif name in ("colors", "depths", "opencv", "fisheye", "ortho"):
         arrays["colors"] = arrays["colors"][:, 0]
     elif name == "colors of each camera":
         arrays["colors"] = np.moveaxis(arrays["colors"][:, :2], 1, 0)
@@ -281,38 +465,53 @@ def test_extreme_values_have_finite_gradients():
     assert dr.grad(inputs["opacities"]).numpy()[1:12:2].any()
 
 
-def test_torch_computes_gradients():
-    """The example of the docstring, against Dr.Jit's own gradients."""
+@pytest.mark.parametrize("name", ["coefficients", "opencv"])
+def test_torch_computes_gradients(name):
+    """They equal those of Dr.Jit, also for parameters of a module and in a batch."""
     torch = pytest.importorskip("torch")
-
-    @dr.wrap(source="torch", target="drjit")
-    def rasterize(*arrays):
-        images, alphas, _ = drgs.rasterization(*arrays, **FILM, sh_degree=3)
-        return images, alphas
-
-    names = list(scene())[:-1]  # without backgrounds
-    arrays = [np.asarray(scene()[name], np.float32) for name in names]
-    leaves = [torch.tensor(array, requires_grad=True) for array in arrays]
-    images, alphas = rasterize(*leaves)
+    arrays = {k: np.asarray(v, np.float32) for k, v in arguments(name).items()}
+    leaves = {k: torch.nn.Parameter(torch.tensor(v[None])) for k, v in arrays.items()}
+    images, alphas, meta = drgs.rasterization(**leaves, **FILM, **SETTINGS[name])
     weights = np.random.default_rng(9).normal(0, 1, images.shape).astype(np.float32)
     ((images * torch.tensor(weights)).sum() + alphas.square().sum()).backward()
 
-    inputs = [llvm.TensorXf(array) for array in arrays]
+    inputs = tensors(arrays, llvm.TensorXf)
     dr.enable_grad(inputs)
-    own, own_alphas, _ = drgs.rasterization(*inputs, **FILM, sh_degree=3)
+    own, own_alphas, values = drgs.rasterization(**inputs, **FILM, **SETTINGS[name])
     loss = dr.sum(own.array * llvm.Float(weights.ravel())) + dr.sum(dr.square(own_alphas.array))
     dr.backward(loss)
-    np.testing.assert_array_equal(images.detach().numpy(), own.numpy())
-    for name, leaf, value in zip(names, leaves, inputs, strict=True):
+    np.testing.assert_array_equal(images.detach().numpy()[0], own.numpy())
+    assert meta["radii"].dtype == torch.int32
+    np.testing.assert_array_equal(meta["radii"].numpy()[0], values["radii"].numpy())
+    for key, value in inputs.items():
         expected = dr.grad(value).numpy()
         # The two sum alphas' squares in orders of their own; the rest is the same computation.
         limit = 1e-5 * np.abs(expected).max()
-        np.testing.assert_allclose(leaf.grad.numpy(), expected, rtol=0, atol=limit, err_msg=name)
+        found = leaves[key].grad.numpy()[0]
+        np.testing.assert_allclose(found, expected, rtol=0, atol=limit, err_msg=key)
+
+
+def test_torch_tensors_of_other_types():
+    """Numbers of 8 bits are converted; Gaussians have 32 or 64 bits, in PyTorch if others do."""
+    torch = pytest.importorskip("torch")
+    arrays, _, options = call_of("colours", ())
+    arrays["colors"] = np.full_like(arrays["colors"], 2)
+    arrays = {k: torch.tensor(v) for k, v in arrays.items()}
+    options |= {"width": 7, "height": 5}
+    images, _, _ = drgs.rasterization(**arrays, **options)
+    converted = {**arrays, "colors": arrays["colors"].to(torch.uint8), "Ks": arrays["Ks"].numpy()}
+    found, _, _ = drgs.rasterization(**converted, **options)
+    assert torch.equal(found, images) and not found.requires_grad
+    for means in (arrays["means"].half(), arrays["means"].numpy()):
+        with pytest.raises(TypeError, match=r"means must be a tensor of PyTorch, .* 32 or 64 bits"):
+            drgs.rasterization(**{**arrays, "means": means}, **options)
 
 
 SKEWED = np.tile(np.array([[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]), (2, 1, 1))
 SKEWED[1, 0, 1] = 0.5
 
+
+UPWARDS = SimpleNamespace(name="ROLLING_BOTTOM_TO_TOP")  # a member of gsplat's enumeration
 
 FLAT = {"sh_degree": None, "colors": np.zeros((24, 3))}
 REFUSED = [
@@ -342,17 +541,32 @@ REFUSED = [
     ),
     ({"eps2d": -1.0}, "eps2d must be finite and not negative, got -1.0"),
     ({"projection": "affine"}, "projection must be one of ewa, exact, unscented"),
-    ({"packed": False}, "packed is a parameter of gsplat's .*; leave it out"),
+    ({"camera_model": "ftheta"}, "camera_model must be one of .*, got 'ftheta'"),
+    ({"rolling_shutter": "UP"}, "rolling_shutter must be one of .*, got 'UP'"),
+    ({"rolling_shutter": UPWARDS}, "viewmats_rs must be given if .* ROLLING_BOTTOM_TO_TOP, got N"),
+    ({"viewmats_rs": np.zeros((2, 4, 4))}, "viewmats_rs must be None if rolling_shutter is GLOBAL"),
+    (
+        {"rolling_shutter": UPWARDS, "viewmats_rs": np.zeros((2, 4, 4))},
+        r"viewmats_rs\[0\] must be rotated by less than half a turn from viewmats\[0\], without",
+    ),
+    ({"radial_coeffs": np.zeros((2, 5))}, r"radial_coeffs must be of shape \(2, 4\) or \(2, 6\)"),
+    ({**FISHEYE, "radial_coeffs": np.zeros((2, 6))}, "radial_coeffs must be k1 to k4 if camera_m"),
+    ({**ORTHO, "tangential_coeffs": np.zeros((2, 2))}, "tangential_coeffs must be None if camera"),
+    ({"radial_coeffs": np.full((2, 4), np.nan)}, "radial_coeffs must be numbers of at most"),
+    ({"means": np.zeros((1, 24, 3))}, r"viewmats must be of shape \(1, C, 4, 4\), got \(2"),
+    ({"means": llvm.TensorXf16(np.zeros((24, 3)))}, "means must be .* of 32 or 64 bits, got Tens"),
+    ({"radius_clip": 2.0}, "radius_clip is a parameter of gsplat's .*; leave it out"),
     ({"with_ut": True}, 'with_ut is .*; give projection="unscented"'),
     ({"projektion": "ewa"}, "no parameter projektion; did you mean projection"),
+    ({"camera_modell": "ortho"}, "no parameter camera_modell; did you mean camera_model"),
     ({**FLAT, "sh_direction": "pixel"}, "sh_direction is of spherical harmonics; give sh_degree"),
 ]
 
 
 @pytest.mark.parametrize(("changes", "message"), REFUSED)
 def test_mismatched_arguments_are_refused_by_name(changes, message):
-    names = {"packed", "with_ut", "projektion"} & set(changes)
-    error = TypeError if names else ValueError
+    names = {"radius_clip", "with_ut", "projektion", "camera_modell"} & set(changes)
+    error = TypeError if names or "32 or 64" in message else ValueError
     with pytest.raises(error, match=rf"rasterization\(\): .*{message}"):
         drgs.rasterization(**{**scene(), **FILM, "sh_degree": 3, **changes})
 
