@@ -31,7 +31,7 @@ class RunProgress:
     A context manager. what: name of the counted items, singular; total, done: their numbers.
     """
 
-    def __init__(self, what: str, total: int, done: int = 0) -> None:
+    def __init__(self, what: str, total: int | None = None, done: int = 0) -> None:
         self._what = what
         self._last_line = time.monotonic()
         self._first: tuple[int, float] | None = None  # (done, time) at the first update

@@ -297,6 +297,9 @@ class OutputConfig(Section):
     """Write renders/<split>/*.png."""
     report: bool = True
     """Write report.html, viewer.html, side_by_side/, curves.png and the orbit."""
+    small_file: str | None = None
+    """Format of a further file, as sog: point_cloud.sog is what other viewers show after 250 more
+    iterations, in which numbers are rounded as in the file. null: none."""
     history_every: Count = Field(10, ge=1)
     """Iterations between rows of history.csv."""
     checkpoint_every: Count | None = Field(500, ge=1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -152,18 +152,20 @@ class FitFolder:
         trainer: Trainer,
         history: History,
         gaussians: Gaussians,
-        for_viewers: ForViewers | None,
+        for_viewers: Mapping[str, ForViewers],
         wall_s: float,
     ) -> FitMetrics:
         """Write the results of a finished fit, and measure them; return ``metrics.json``.
 
-        for_viewers: None if other viewers render as the fit does; wall_s: time of iterations.
+        for_viewers: by file, where other viewers do not render as the fit does, or have a small
+        file; wall_s: time of iterations.
         """
         out, config, dataset, render = self.path, trainer.config, trainer.dataset, trainer.images
         with suppress(OSError):  # of a fit that goes on: no longer true
             (out / folder.METRICS).unlink()
         own = saved_gaussians(gaussians, config)
-        other = bake_smoothing(own) if for_viewers is None else for_viewers.gaussians
+        is_own = folder.GAUSSIANS not in for_viewers
+        other = bake_smoothing(own) if is_own else for_viewers[folder.GAUSSIANS].gaussians
         write_gaussians(out, own, other)
         for effect in trainer.effects:
             effect.write(out, dataset)
@@ -176,11 +178,16 @@ class FitFolder:
         scores = write_images(out, dataset, render, output.save_renders, output.report)
         test = SplitMetrics(**vars(mean_of(scores)), split=split)
         metrics = self._metrics(config, gaussians.num_gaussians, wall_s, test)
-        if for_viewers is not None:
+        for name, each in for_viewers.items():
             views = evenly_spaced(dataset.test, MAX_PICTURES)
-            images = zip(for_viewers.images(views), views, strict=True)
+            images = zip(each.images(views), views, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
-            metrics["viewers"] = SplitMetrics(**vars(quality), split=split)
+            found = SplitMetrics(**vars(quality), split=split)
+            if name == folder.GAUSSIANS:
+                metrics["viewers"] = found
+                continue
+            each.gaussians.save(out / name)
+            metrics["small_file"] = {**found, "bytes": (out / name).stat().st_size}
         if output.report:
             approximations = config.model.approximations
             shown = DisplaySettings(bake_smoothing(gaussians), approximations)
@@ -230,6 +237,9 @@ class FitFolder:
         if viewers is not None:
             path = self.path / folder.GAUSSIANS
             lines.append(f"as other viewers show {path}: PSNR {viewers['psnr']:.2f} dB")
+        if (small := metrics.get("small_file")) is not None:
+            size = f"{small['bytes'] / 1e6:.2f} MB"
+            lines.append(f"as they show the small file, {size}: PSNR {small['psnr']:.2f} dB")
         lines.append(f"written: {self.path}")
         if cast("dict[str, object]", metrics["config"]["output"])["report"]:
             lines.append(f"open {self.path / folder.REPORT}")

@@ -30,6 +30,7 @@ from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.folders import config_for
 from drgs.effects.base import ChosenEffects, Examiner, TrainingEffect
+from drgs.effects.smoothing import bake_smoothing
 from drgs.fit.budget import Budget, Plan, deadline, plan_fit, rehearse
 from drgs.fit.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.fit.fingerprint import Fingerprint, fingerprint_of
@@ -47,13 +48,13 @@ from drgs.fit.loop import (
 )
 from drgs.fit.memory import room_for_targets
 from drgs.fit.summary import summary_of_fit
-from drgs.fit.viewers_fit import ForViewers, for_viewers, num_iterations
+from drgs.fit.viewers_fit import ForViewers, fit_small_file, for_viewers, small_file_name
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import description_of_start, gaussians_at, start_of
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import format_effects
-from drgs.results.folder import BUDGET_PLAN, EXAMINATION
+from drgs.results.folder import BUDGET_PLAN, EXAMINATION, GAUSSIANS
 from drgs.results.history import HistoryRow
 from drgs.training.contracts import NO_PARTS, GivenParts
 from drgs.training.density.strategy import DensityStrategy
@@ -193,6 +194,7 @@ class FitSession:
             if checkpoint is not None:
                 check_same_data(folder.path, config.data.path, checkpoint.data, self._fingerprint)
         self.config = resolve_defaults(config, self.dataset)
+        small_file_name(self.config)  # refuses formats now
         return checkpoint
 
     def _examine(self, given: FitConfig) -> None:
@@ -315,21 +317,23 @@ class FitSession:
             )
         release_unused_memory()  # encoding the orbit's frames takes as much as iterations do
         trainer.full_scene()  # gathered from all ranks
-        others = None
-        if not trainer.config.model.approximations.is_default:
-            others = self._fit_for_viewers(gaussians)
+        others, config = {}, trainer.config
+        if not config.model.approximations.is_default:
+            others[GAUSSIANS] = self._fit_for_viewers(for_viewers, gaussians)
+        if name := small_file_name(config):
+            start = others[GAUSSIANS].gaussians if others else bake_smoothing(gaussians)
+            others[name] = self._fit_for_viewers(fit_small_file, start)
         if self.folder is not None:
             results = trainer, self.history, gaussians, others, wall_s
             metrics = self.folder.write_results(*results)
             self._print(self.folder.describe(metrics))
 
-    def _fit_for_viewers(self, gaussians: Gaussians) -> ForViewers:
+    def _fit_for_viewers(self, fit: Callable[..., ForViewers], start: Gaussians) -> ForViewers:
         """Return Gaussians for other viewers; the trainer is released, and renders the fit's."""
         if not self.uses_terminal:
-            return for_viewers(self.trainer, gaussians)
-        total = num_iterations(self.trainer.config)
-        with RunProgress("iteration for viewers", total) as shown:
-            return for_viewers(self.trainer, gaussians, lambda done: shown.update(done, total))
+            return fit(self.trainer, start)
+        with RunProgress("iteration for viewers") as shown:
+            return fit(self.trainer, start, shown.update)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,12 @@
-"""Gaussians for other viewers: ``point_cloud.ply``, if the fit renders otherwise.
+"""Gaussians for other viewers: ``point_cloud.ply``, if the fit renders otherwise, and a small file.
 
 Viewers render with the defaults of ``drgs.config.approximations``. A copy of Gaussians that were
 fitted with other settings is changed in closed form (``drgs.effects.smoothing``) and then fitted
 for a few more iterations with the viewers' settings, a fixed number of Gaussians, and the fit's
 cameras and colours. The fit's own Gaussians do not depend on it.
+
+A small file (``output.small_file``) has further iterations of its own, whose images are of rounded
+numbers.
 """
 
 from __future__ import annotations
@@ -19,20 +22,30 @@ import numpy as np
 from drgs.config.approximations import DECLARED
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig, ModelConfig
-from drgs.core.errors import UserError, note_user
+from drgs.core.errors import UserError, note_user, one_line
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import View
 from drgs.effects.base import TrainingEffect
 from drgs.effects.colors import ColorConfig
 from drgs.effects.smoothing import bake_for_viewers, bake_smoothing
 from drgs.fit.inputs import share_gaussians
-from drgs.gaussians.parameters import Gaussians
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene, render_views
+from drgs.io.formats import FORMATS
+from drgs.results.folder import small_file_names
 from drgs.training.rates import TOUCH_UP_RATES
-from drgs.training.trainer import Trainer
+from drgs.training.trainer import StepReport, Trainer
 
 ITERATIONS_SHARE, TIME_SHARE = 0.08, 0.12
 """Share of the fit's iterations, and of its time: late iterations take longer."""
+
+ROUNDED_ITERATIONS, SMALL_FILE_TIME_SHARE = 250, 0.2
+"""Iterations with rounded numbers, and their share of the time of a fit that has few itself."""
+
+HARMONICS_FACTOR = 4
+"""Times the rate of harmonics, where a file shares them among Gaussians: steps are averaged."""
+
+Watch = Callable[[int, int], None]
 
 NEGLIGIBLE_RATE = 1e-9  # rate of values that are to stay, where 0 is not a rate
 
@@ -59,32 +72,103 @@ def num_iterations(config: FitConfig) -> int:
 
 
 def for_viewers(
-    trainer: Trainer, gaussians: Gaussians, watch: Callable[[int], None] = lambda done: None
+    trainer: Trainer, gaussians: Gaussians, watch: Watch = lambda *_: None
 ) -> ForViewers:
     """Fit a copy of a fit's Gaussians as viewers render.
 
     trainer: of the finished fit; is released (:meth:`drgs.training.trainer.Trainer.release`).
-    gaussians: ``trainer.gaussians()``. watch: called after each iteration with their number.
+    gaussians: ``trainer.gaussians()``. watch: called after each step with the number of iterations
+    that are done, and of all.
 
     If it fails, the closed form is returned, with a :class:`UserNote`.
     """
     others = trainer.config.model.approximations.non_default
-    start, further = _closed_form(trainer, gaussians), tuning(trainer.config)
+    start = _closed_form(trainer, gaussians)
+    start = replace(start, rendered_with={name: DECLARED[name].default for name in others})
+    further = tuning(trainer.config, num_iterations(trainer.config))
+    return _fit_further(trainer, further, start, Trainer.step, watch)
+
+
+def small_file_name(config: FitConfig) -> str | None:
+    """Return the name of ``output.small_file``; raise :class:`UserError` for another format."""
+    if (name := config.output.small_file) is None:
+        return None
+    if name not in (names := small_file_names()):
+        raise UserError(
+            f"output.small_file: must be one of {', '.join(names)}, or null, got {one_line(name)}; "
+            "drgs export writes other formats"
+        )
+    return names[name]
+
+
+def fit_small_file(
+    trainer: Trainer, start: Gaussians, watch: Watch = lambda *_: None
+) -> ForViewers:
+    """Fit Gaussians for viewers as ``output.small_file`` rounds them; they are rounded.
+
+    start: those of the larger file; trainer, watch: as for :func:`for_viewers`. Several processes
+    do not fit it: then numbers are as they were.
+    """
+    assert trainer.config.output.small_file is not None
+    start = replace(start, rendered_with=None)
+    further = tuning(trainer.config, ROUNDED_ITERATIONS)
+    rate = HARMONICS_FACTOR * further.optimizer.shN_lr
+    further = with_changes(further, {"optimizer.shN_lr": rate})
+    if trainer.comm.size > 1:
+        note_user("output.small_file: several processes do not fit it; it is larger, and worse")
+        effects, background = trainer.effects, trainer.dataset.background
+        return ForViewers(start, further.model, background, effects)
+    steps = _RoundedSteps(start, trainer.config.output.small_file)
+    return _fit_further(trainer, further, replace(start, **steps.rounded), steps, watch)
+
+
+class _RoundedSteps:
+    """Steps of a trainer whose images are of rounded numbers.
+
+    Derivatives with respect to these move the numbers that are not rounded: the straight-through
+    estimator of Bengio et al. 2013, arXiv:1308.3432.
+    """
+
+    def __init__(self, start: Gaussians, format_name: str) -> None:
+        self._values = {name: np.array(getattr(start, name)) for name in PARAMETER_NAMES}
+        self._round = FORMATS.get(format_name).value().rounding(self._values)
+        self.rounded = self._round_values()
+
+    def _round_values(self) -> dict[str, np.ndarray]:
+        return {k: v.astype(np.float32) for k, v in self._round(self._values).items()}
+
+    def __call__(self, trainer: Trainer) -> StepReport:
+        report, former = trainer.step(), self.rounded
+        for name, value in trainer.parameters.items():
+            self._values[name] += np.array(value) - former[name]
+        self.rounded = self._round_values()
+        for name, value in trainer.parameters.items():
+            trainer.optimizer[name] = type(value)(self.rounded[name])
+        return report
+
+
+def _fit_further(
+    trainer: Trainer,
+    further: FitConfig,
+    start: Gaussians,
+    step: Callable[[Trainer], StepReport],
+    watch: Watch,
+) -> ForViewers:
+    """Return ``start`` after more iterations with the configuration ``further``."""
     trainer.release()
     try:
         tuner = trainer.spawn(further, share_gaussians(trainer.comm, start))
         tuner.warm_start(trainer)
         while tuner.iteration < further.iterations:
-            if tuner.step().passes(further.output.history_every):
+            if step(tuner).passes(further.output.history_every):
                 tuner.check_iterations()
-            watch(tuner.iteration - trainer.iteration)
-        tuned = tuner.gaussians()
+            watch(tuner.iteration - trainer.iteration, further.iterations - trainer.iteration)
+        tuned = replace(tuner.gaussians(), rendered_with=start.rendered_with)
     except UserError as error:  # numbers that are not finite, or too little memory by now
         note_user(f"the Gaussians for viewers are not fitted any further: {error}")
         tuned = start
     release_unused_memory()  # share of the time of those iterations
-    gaussians = replace(tuned, rendered_with={name: DECLARED[name].default for name in others})
-    return ForViewers(gaussians, further.model, trainer.dataset.background, trainer.effects)
+    return ForViewers(tuned, further.model, trainer.dataset.background, trainer.effects)
 
 
 def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
@@ -95,10 +179,10 @@ def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
         return bake_for_viewers(on_device, cameras, trainer.config.model.approximations)
 
 
-def tuning(config: FitConfig) -> FitConfig:
-    """Return the configuration of the extra iterations after a fit with ``config``."""
+def tuning(config: FitConfig, iterations: int) -> FitConfig:
+    """Return the configuration of so many extra iterations after a fit with ``config``."""
     before = config.last_iteration
-    total = before + num_iterations(config)
+    total = before + iterations
     kept = {"max_gaussians": config.densify.max_gaussians}
     views_per_step = config.optimizer.views_per_step  # which processes may share
     changes = {

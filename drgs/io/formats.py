@@ -11,7 +11,7 @@ suffix of a file's name. :func:`read_gaussians` and :func:`encode` check all arr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
@@ -38,6 +38,9 @@ SHAPES = {
 
 Arrays = Mapping[str, np.ndarray]
 """Float32 arrays (N, *shape) by name, as the fields of ``Gaussians``; quaternions are wxyz."""
+
+Rounding = Callable[[Arrays], Arrays]
+"""Function from Gaussians to those that are read from a file of them, in the same order."""
 
 ORIGIN = ("origin_x", "origin_y", "origin_z")  # in ``rendered_with``: world, of the means
 
@@ -97,6 +100,13 @@ class FileFormat:
         """
         raise UserError("files of this format can be read, but not written")
 
+    def rounding(self, gaussians: Arrays) -> Rounding:
+        """Return how files round Gaussians like these, so that fits can take part in it.
+
+        :meth:`encode` keeps what was rounded once. Optional: see ``output.small_file``.
+        """
+        raise UserError("fits do not know how files of this format are rounded")
+
     def __init_subclass__(cls) -> None:
         if not getattr(cls, "suffix", "").startswith(".") or cls.suffix != cls.suffix.lower():
             raise TypeError(f"{cls.__name__}.suffix must be a suffix in small letters, as .npz")
@@ -120,6 +130,11 @@ def readable_formats() -> list[Extension[type[FileFormat]]]:
 def writable_formats() -> list[Extension[type[FileFormat]]]:
     """Return the formats whose files can be written."""
     return [each for each in FORMATS.all() if each.value.encode is not FileFormat.encode]
+
+
+def fitted_formats() -> list[Extension[type[FileFormat]]]:
+    """Return the formats whose rounding a fit can take part in."""
+    return [each for each in FORMATS.all() if each.value.rounding is not FileFormat.rounding]
 
 
 def _shipped_formats() -> list[Extension[type[FileFormat]]]:

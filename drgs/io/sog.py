@@ -38,7 +38,7 @@ from drgs.config.section import parse_json, validate
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular, read_bytes, refuse_damage
 from drgs.core.memory import require_memory
-from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
+from drgs.io.formats import FORMATS, Arrays, FileFormat, Rounding, Scalar
 from drgs.io.quantization import (
     drop_largest_component,
     logits_from_opacities,
@@ -61,6 +61,9 @@ FIRST_TAG = 252  # alpha of a quaternion whose largest component is w
 NUM_HARMONICS = (0, 3, 8, 15)  # above degree 0, by degree
 PALETTE_COLUMNS = 64
 MAX_PALETTE = 65536
+
+FITTED_SHARE = 1 / 6
+"""Entries of the palette by Gaussian, where Gaussians are fitted as they are rounded."""
 
 CELLS = 256
 """Parts of the space of harmonics, in each of which k-means chooses a share of the palette: the
@@ -97,19 +100,12 @@ class Sog(FileFormat):
         num, degree = meta.count, meta.shN.bands if meta.shN else 0
         require_scene_memory(path, num, (degree + 1) ** 2)
         low, high = (_pixels(path, n, num)[:, :3].astype(np.uint16) for n in meta.means.files)
-        mins, maxs = np.array(meta.means.mins), np.array(meta.means.maxs)
-        logs = mins + (low | high << 8) / POSITION_LEVELS * (maxs - mins)
+        bounds = np.array(meta.means.mins), np.array(meta.means.maxs)
         parts = (meta.quats, meta.scales, meta.sh0)
         quats, scales, sh0 = (_pixels(path, part.files[0], num) for part in parts)
-        largest = quats[:, 3].astype(np.intp) - FIRST_TAG
-        others = (quats[:, :3] / 127.5 - 1) / np.sqrt(2)
         arrays = {
-            "means": np.sign(logs) * np.expm1(np.abs(logs)),
-            "quats": np.where(  # PlayCanvas's reader, too, has the identity for other tags
-                largest[:, None] < 0,
-                [1.0, 0, 0, 0],
-                restore_largest_component(np.maximum(largest, 0), others),
-            ),
+            "means": _means(low | high << 8, *bounds),
+            "quats": _quaternions(quats),
             "log_scales": np.array(meta.scales.codebook)[scales[:, :3]],
             "logit_opacities": logits_from_opacities(sh0[:, 3] / 255),
             "sh0": np.array(meta.sh0.codebook)[sh0[:, None, :3]],
@@ -131,10 +127,44 @@ class Sog(FileFormat):
         return arrays, parts[0][1]
 
     @override
+    def rounding(self, gaussians: Arrays) -> Rounding:
+        """Return rounding with these Gaussians' bounds, codebooks, and choice in a small palette.
+
+        Entries of the palette are the mean harmonics of those that have chosen them.
+        """
+        num = len(gaussians["means"])
+        low, high = _bounds(gaussians["means"])
+        codes = {name: _codebook(gaussians[name])[0] for name in ("log_scales", "sh0")}
+        rows = gaussians["shN"].reshape(num, -1)
+        _, labels = _palette(rows, max(CELLS, round(FITTED_SHARE * num)))
+        order = np.argsort(labels, kind="stable")
+        starts = np.flatnonzero(np.diff(labels[order], prepend=-1))
+        sizes = np.diff(starts, append=num)[:, None].astype(np.float32)
+
+        def entries(g: Arrays) -> np.ndarray:
+            return np.add.reduceat(g["shN"].reshape(num, -1)[order], starts) / sizes
+
+        harmonics = _codebook(entries(gaussians))[0] if rows.size else np.zeros(LEVELS)
+
+        def round_values(g: Arrays) -> Arrays:
+            opacities = _opacity_levels(g["logit_opacities"]) / 255
+            palette = harmonics[_nearest(harmonics, entries(g))]
+            return {
+                "means": _means(_mean_levels(g["means"], low, high), low, high),
+                "quats": _quaternions(_quaternion_levels(g["quats"])),
+                **{name: code[_nearest(code, g[name])] for name, code in codes.items()},
+                "logit_opacities": logits_from_opacities(opacities),
+                "shN": palette[labels].reshape(g["shN"].shape),
+            }
+
+        return round_values
+
+    @override
     def encode(self, gaussians: Arrays, rendered_with: Mapping[str, Scalar]) -> bytes:
         """Return an archive of the Gaussians in Morton order.
 
-        Up to 65,536 Gaussians have an entry each in the palette of harmonics.
+        Up to 65,536 different harmonics have an entry each in the palette, and up to 256 different
+        numbers one in a codebook: what was rounded before stays as it is.
         """
         order = morton_order(gaussians["means"])
         ordered = {name: values[order] for name, values in gaussians.items()}
@@ -147,27 +177,22 @@ class Sog(FileFormat):
 
 def encode_files(g: Arrays, rendered_with: Mapping[str, Scalar]) -> dict[str, bytes]:
     """Return the files of an archive by name, the last one :data:`META`; g: keep their order."""
-    means = g["means"].astype(np.float64)
-    logs = np.sign(means) * np.log1p(np.abs(means))
-    low, high = logs.min(axis=0), logs.max(axis=0)
-    parts = (logs - low) / np.where(high > low, high - low, 1)
-    levels = round_to_uint32(parts * POSITION_LEVELS, POSITION_LEVELS)
-    index, others = drop_largest_component(normalize_quaternions(g["quats"]))
-    components = round_to_uint32((others * np.sqrt(2) + 1) * 127.5, 255)
+    num = len(g["means"])
+    low, high = _bounds(g["means"])
+    levels = _mean_levels(g["means"], low, high)
     log_scales, scales = _codebook(g["log_scales"])
     colors, sh0 = _codebook(g["sh0"][:, 0])
-    opacities = round_to_uint32(opacities_from_logits(g["logit_opacities"]) * 255, 255)
     images = {
         "means_l": _per_gaussian(levels & 255),
         "means_u": _per_gaussian(levels >> 8),
         "scales": _per_gaussian(scales),
-        "quats": _per_gaussian(np.column_stack([components, FIRST_TAG + index])),
-        "sh0": _per_gaussian(np.column_stack([sh0, opacities])),
+        "quats": _per_gaussian(_quaternion_levels(g["quats"])),
+        "sh0": _per_gaussian(np.column_stack([sh0, _opacity_levels(g["logit_opacities"])])),
     }
     meta: dict[str, object] = {
         "version": 2,
         "asset": {"generator": "drgs"},
-        "count": len(means),
+        "count": num,
         "means": {"mins": low.tolist(), "maxs": high.tolist()},
         "scales": {"codebook": log_scales.tolist()},
         "quats": {},
@@ -177,7 +202,7 @@ def encode_files(g: Arrays, rendered_with: Mapping[str, Scalar]) -> dict[str, by
         meta |= {"model": "antialiased", "antialias": True}
     if g["shN"].shape[1]:
         bands = NUM_HARMONICS.index(g["shN"].shape[1])
-        palette, labels = _palette(g["shN"].reshape(len(means), -1))
+        palette, labels = _palette(g["shN"].reshape(num, -1), MAX_PALETTE)
         codebook, entries = _codebook(palette)
         num_rows = -(-len(palette) // PALETTE_COLUMNS)
         rows = np.zeros((num_rows * PALETTE_COLUMNS, palette.shape[1]))
@@ -293,6 +318,46 @@ def _read_harmonics(path: Path, part: _Harmonics, num: int) -> np.ndarray:
     return np.array(part.codebook, np.float32)[entries].reshape(-1, count, 3)[index]
 
 
+def _logarithms(means: np.ndarray) -> np.ndarray:
+    """Return sign(x) log(1 + |x|), float64."""
+    means = means.astype(np.float64)
+    return np.sign(means) * np.log1p(np.abs(means))
+
+
+def _bounds(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    logs = _logarithms(means)
+    return logs.min(axis=0), logs.max(axis=0)
+
+
+def _mean_levels(means: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    parts = (_logarithms(means) - low) / np.where(high > low, high - low, 1)
+    return round_to_uint32(parts * POSITION_LEVELS, POSITION_LEVELS)
+
+
+def _means(levels: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    logs = low + levels / POSITION_LEVELS * (high - low)
+    return np.sign(logs) * np.expm1(np.abs(logs))
+
+
+def _quaternion_levels(quats: np.ndarray) -> np.ndarray:
+    """Return pixels (N, 4)."""
+    index, others = drop_largest_component(normalize_quaternions(quats))
+    components = round_to_uint32((others * np.sqrt(2) + 1) * 127.5, 255)
+    return np.column_stack([components, FIRST_TAG + index])
+
+
+def _quaternions(levels: np.ndarray) -> np.ndarray:
+    largest = levels[:, 3].astype(np.intp) - FIRST_TAG
+    found = restore_largest_component(
+        np.maximum(largest, 0), (levels[:, :3] / 127.5 - 1) / np.sqrt(2)
+    )  # PlayCanvas's reader, too, has the identity for other tags
+    return np.where(largest[:, None] < 0, [1.0, 0, 0, 0], found)
+
+
+def _opacity_levels(logit_opacities: np.ndarray) -> np.ndarray:
+    return round_to_uint32(opacities_from_logits(logit_opacities) * 255, 255)
+
+
 def _per_gaussian(rows: np.ndarray) -> np.ndarray:
     """Return an image (H, W, C) of rows (N, C), with sides that are multiples of 4."""
     width = 4 * math.ceil(math.sqrt(len(rows)) / 4)
@@ -310,10 +375,14 @@ def _encode(image: np.ndarray) -> bytes:
 
 
 def _codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return 256 numbers, float32, and the index of the nearest for each value.
+    """Return 256 numbers, float32, in order, and the index of the nearest for each value.
 
-    Lloyd 1982, "Least squares quantization in PCM", from quantiles and steps of equal width.
+    Up to 256 different values are kept. Others: Lloyd 1982, "Least squares quantization in PCM",
+    from quantiles and steps of equal width.
     """
+    if len(distinct := np.unique(values)) <= LEVELS:
+        codes = np.pad(distinct, (0, LEVELS - len(distinct)), "edge")
+        return codes, _nearest(codes, values)
     ordered = np.sort(values, axis=None).astype(np.float64)
     sums = np.concatenate([[0], np.cumsum(ordered)])
     steps = np.linspace(0, 1, LEVELS // 2)
@@ -325,17 +394,23 @@ def _codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         counts = np.diff(ends)
         codes = np.where(counts > 0, np.diff(sums[ends]) / np.maximum(counts, 1), codes)
     codes = np.sort(codes).astype(np.float32)
-    return codes, np.searchsorted((codes[1:] + codes[:-1]) / 2, values)
+    return codes, _nearest(codes, values)
 
 
-def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most 65,536 rows (P, D) that stand for rows (N, D), and their indices (N,).
+def _nearest(codes: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.searchsorted((codes[1:] + codes[:-1]) / 2, values)
+
+
+def _palette(rows: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return at most ``most`` rows (P, D) that stand for rows (N, D), and their indices (N,).
 
     k-means in parts of the space, which are k-means clusters themselves, from rows at equal
     distances in Morton order: deterministic. A part has entries in proportion to its variance.
     """
-    if len(rows) <= MAX_PALETTE:
-        return rows, np.arange(len(rows))
+    distinct, inverse = np.unique(rows, axis=0, return_inverse=True)
+    labels = inverse.reshape(-1)
+    if len(distinct) <= most:
+        return distinct, labels
     centers, cells = _kmeans(rows, CELLS)
     members = [np.flatnonzero(cells == cell) for cell in range(CELLS)]
     sizes = np.array([len(member) for member in members])
@@ -343,17 +418,18 @@ def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     shares = spread / max(spread.sum(), np.finfo(np.float32).tiny)
     counts = np.minimum(sizes, 1)
     for _ in range(4):  # parts that need no more leave theirs to others
-        shares *= MAX_PALETTE - CELLS
+        shares *= most - CELLS
         counts = np.minimum(sizes, 1 + shares).astype(np.intp)
         shares /= counts.sum()
-    entries, labels, num = [], np.empty(len(rows), np.intp), 0
+    entries, num = [], 0
     for each, count in zip(members, counts, strict=True):
         if count:
             centroids, labels[each] = _kmeans(rows[each], count)
             labels[each] += num
             entries.append(centroids)
             num += count
-    return np.concatenate(entries), labels
+    used, labels = np.unique(labels, return_inverse=True)
+    return np.concatenate(entries)[used], labels
 
 
 def _kmeans(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -23,6 +23,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError, UserNote, format_names, note_user, one_line
 from drgs.core.files import is_temporary, read_text, refusal_reason, remove_stale_temporaries
 from drgs.core.folders import FolderRecord
+from drgs.io.formats import fitted_formats
 
 # Names of the files and folders in a fit's output folder.
 
@@ -55,7 +56,13 @@ def result_names() -> list[str]:
         names += each.value.files or [f"{each.name}.json"] * each.value.has_numbers
     names += [CHECKPOINT, CURVES, DENSITY, EXAMINATION, HISTORY, METRICS, ORBIT, ORBIT_GIF]
     names += [BUDGET_PLAN, CAMERAS, RENDERS, REPORT, SIDE_BY_SIDE, VIEWER, VIEWS]
+    names += small_file_names().values()
     return [*names, GAUSSIANS, OWN_GAUSSIANS, EARLIER_FOR_VIEWERS]
+
+
+def small_file_names() -> dict[str, str]:
+    """Return the names of the files of ``output.small_file``, by format."""
+    return {each.name: f"point_cloud{each.value.suffix}" for each in fitted_formats()}
 
 
 def own_gaussians(folder: Path) -> Path:

@@ -44,6 +44,12 @@ class SplitMetrics(TypedDict):
     split: str
 
 
+class SmallFileMetrics(SplitMetrics):
+    """The quality of a small file, and its size."""
+
+    bytes: int
+
+
 class FitMetrics(TypedDict):
     """The content of a fit's ``metrics.json``."""
 
@@ -52,6 +58,7 @@ class FitMetrics(TypedDict):
     wall_s: float  # of the iterations
     test: SplitMetrics
     viewers: NotRequired[SplitMetrics]  # of the file for viewers, in their rendering
+    small_file: NotRequired[SmallFileMetrics]  # of ``output.small_file``, likewise
     seed: int
     versions: dict[str, str]
     variant: str

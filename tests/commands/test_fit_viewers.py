@@ -238,3 +238,26 @@ def test_files_are_of_their_kind_at_every_moment(tmp_path, monkeypatch, before, 
     assert {*os.listdir(tmp_path)} == {*files}
     for name, each in files.items():
         assert Gaussians.load(tmp_path / name).rendered_with == each.rendered_with
+
+
+def test_a_small_file_is_written_and_measured(tmp_path, monkeypatch):
+    without_images(monkeypatch)
+    monkeypatch.setattr("drgs.fit.viewers_fit.ROUNDED_ITERATIONS", 2)
+    config, out = write_project(tmp_path), tmp_path / "out"
+    printed = assert_fits(config, "--out", out, "--set", "output.small_file=sog")
+    found = json.loads((out / METRICS).read_text())["small_file"]
+    assert found["bytes"] == (out / "point_cloud.sog").stat().st_size
+    assert f"PSNR {found['psnr']:.2f} dB" in printed.stdout
+    read = Gaussians.load(out / "point_cloud.sog")
+    assert read.num_gaussians == Gaussians.load(out / GAUSSIANS).num_gaussians
+    remove_run(out)
+    assert contents(out) == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("ply", "must be one of sog"), ("sogg", "must be one of sog, or null")]
+)
+def test_other_small_files_are_refused_before_the_fit(tmp_path, name, reason):
+    config = write_project(tmp_path)
+    options = ("--out", tmp_path / "out", "--set", f"output.small_file={name}")
+    assert_fit_refused(config, *options, folder=tmp_path, message=f"output.small_file: {reason}")

@@ -1,5 +1,7 @@
 """Gaussians that are fitted further as viewers render them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support import small_fits as fits
@@ -10,8 +12,11 @@ from drgs.config.changes import with_changes
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserNote
 from drgs.fit import viewers_fit as viewers
-from drgs.fit.viewers_fit import for_viewers, num_iterations, tuning
+from drgs.fit.viewers_fit import fit_small_file, for_viewers, num_iterations, tuning
+from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene, render_views
+from drgs.io import sog
+from drgs.io.quantization import morton_order
 from drgs.training.trainer import Trainer
 
 NON_VIEWER_SETTINGS = {"model.antialiased": True, "model.low_pass": 0.02}
@@ -21,7 +26,9 @@ def ended_fit(iterations=20, **changes):
     """A trainer that has done all of its iterations, its dataset, and its Gaussians."""
     dataset = fits.plain_dataset()
     config = with_changes(fits.config_of(iterations=iterations), {**NON_VIEWER_SETTINGS, **changes})
-    trainer = fits.steps(Trainer(config, dataset, fits.disturbed_blobs()), iterations)
+    start = fits.disturbed_blobs()
+    start = replace(start, shN=start.shN[:, : (config.model.sh_degree + 1) ** 2 - 1])
+    trainer = fits.steps(Trainer(config, dataset, start), iterations)
     return trainer, dataset, trainer.gaussians()
 
 
@@ -35,8 +42,8 @@ def test_iterations_improve_images_of_viewers(monkeypatch):
     monkeypatch.setattr(viewers, "ITERATIONS_SHARE", 1.0)
     trainer, dataset, gaussians = ended_fit()
     before, counted = list(trainer.images(dataset.test)), []
-    found = for_viewers(trainer, gaussians, counted.append)
-    assert counted == list(range(1, 21))
+    found = for_viewers(trainer, gaussians, lambda *done: counted.append(done))
+    assert counted == [(k, 20) for k in range(1, 21)]
     model = ModelConfig(near=0.2, **VIEWER_RENDERING)
 
     def in_viewers(gaussians):
@@ -58,12 +65,12 @@ def test_refined_cameras_and_colours_are_kept():
     trainer, _, gaussians = ended_fit(8, **changes)
     before = {effect.name: effect.values() for effect in trainer.effects}
     tuners = []
-    found = for_viewers(trainer, gaussians, lambda done: tuners.append(done))
+    found = for_viewers(trainer, gaussians, lambda *done: tuners.append(done))
     assert len(tuners) == num_iterations(trainer.config) == 1
     for effect in found.effects:
         for name, values in effect.values().items():
             np.testing.assert_array_equal(values, before[effect.name][name])
-    config = tuning(trainer.config)
+    config = tuning(trainer.config, 1)
     colors = config.sections["colors"]
     assert colors.lr == colors.vignetting_lr == viewers.NEGLIGIBLE_RATE
     assert config.sections["cameras"].rotation_lr == 0 and len(found.effects) == 3
@@ -90,9 +97,31 @@ def test_nonfinite_values_fall_back_to_the_closed_form(monkeypatch):
 def test_tuning_keeps_the_population_and_continues_the_schedule():
     changes = {**NON_VIEWER_SETTINGS, "model.order": "pixel", "coarse": [{"until": 9, "factor": 2}]}
     config = with_changes(fits.config_of(iterations=400), changes)
-    further = tuning(config)
+    further = tuning(config, 32)
     assert further.iterations == 432 and further.densify.stop == 1 and further.coarse == []
     assert further.optimizer.decay_from == 400 / 432
     assert further.model.approximations.is_default and not config.model.approximations.is_default
     assert further.model.sh_degree == config.model.sh_degree
     assert further.loss == config.loss and further.data == config.data
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_a_small_file_shows_what_was_fitted(tmp_path, monkeypatch, degree):
+    """The images that are measured are those of the file, and nearer than without iterations."""
+    monkeypatch.setattr(viewers, "ROUNDED_ITERATIONS", 30)
+    monkeypatch.setattr(sog, "CELLS", 2)  # so that the palette has fewer entries than Gaussians
+    changes = {"model.sh_degree": degree, "model.sh_increase_every": 2, "output.small_file": "sog"}
+    trainer, dataset, gaussians = ended_fit(20, **changes)
+    found = fit_small_file(trainer, gaussians)
+    found.gaussians.save(tmp_path / "a.sog")
+    read = Gaussians.load(tmp_path / "a.sog")
+    order = morton_order(found.gaussians.means)  # in which the file has them
+    for name in PARAMETER_NAMES:
+        # 16 bits of positions between bounds that may be narrower by a step or two.
+        atol = 1e-4 if name == "means" else 0
+        expected = getattr(found.gaussians, name)[order]
+        np.testing.assert_allclose(getattr(read, name), expected, rtol=1e-5, atol=atol)
+    monkeypatch.setattr(viewers, "ROUNDED_ITERATIONS", 1)
+    other = fit_small_file(trainer, gaussians)
+    fitted, rounded = (psnr(each.images(dataset.test), dataset) for each in (found, other))
+    assert fitted > rounded + 0.1

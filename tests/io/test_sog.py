@@ -100,12 +100,11 @@ def test_a_codebook_is_nearly_the_best():
 
 
 def test_a_palette_stands_for_more_gaussians_than_it_has_entries(monkeypatch):
-    monkeypatch.setattr(sog, "MAX_PALETTE", 300)
     monkeypatch.setattr(sog, "CELLS", 10)
     rng = np.random.default_rng(0)
     centres = rng.normal(size=(250, 9)).astype(np.float32)
     rows = np.repeat(centres, 8, axis=0) + rng.normal(0, 0.01, (2000, 9)).astype(np.float32)
-    palette, labels = sog._palette(rows)
+    palette, labels = sog._palette(rows, 300)
     assert len(palette) <= 300 and labels.min() == 0 and labels.max() < len(palette)
     error = np.square(palette[labels] - rows).sum(axis=1)
     assert np.median(error) < 9 * 0.01**2 * 2
