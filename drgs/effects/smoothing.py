@@ -163,15 +163,18 @@ MIN_VARIANCE_SHARE = 0.04
 """Share of its variance that a Gaussian keeps along each axis: flatter ones would have next to no
 derivatives by their scales."""
 
-VIEWER_APPROXIMATIONS = Approximations()  # approximations of viewers
-
 
 def bake_for_viewers(
-    gaussians: Gaussians, cameras: Iterable[Camera], fitted: Approximations
+    gaussians: Gaussians,
+    cameras: Iterable[Camera],
+    fitted: Approximations,
+    shown: Approximations = Approximations(),  # noqa: B008  (frozen)
 ) -> Gaussians:
-    """Return Gaussians (numpy) that look the same without ``low_pass`` and ``antialiased``.
+    """Return Gaussians (numpy) that look the same with other approximations.
 
-    With l and L the low-pass of the fit and that of viewers, and nu the largest rate (px per scene
+    These are ``low_pass`` and ``antialiased`` of ``shown``, in place of those of ``fitted``.
+
+    With l and L the low-pass of ``fitted`` and of ``shown``, and nu the largest rate (px per scene
     unit) of the ``cameras`` that see a Gaussian,
 
         s'^2 = max(s^2 - (L - l) / nu^2, 0.04 s^2),   o' = o sum(a sqrt(det C)) / sum(sqrt(det C')),
@@ -184,13 +187,13 @@ def bake_for_viewers(
     cameras = list(cameras)
     host = dr.detach(gaussians).numpy()
     nyquist = np.array(smoothing_of(gaussians.means, cameras), np.float64)
-    difference = VIEWER_APPROXIMATIONS.low_pass - fitted.low_pass
+    difference = shown.low_pass - fitted.low_pass
     taken = difference * np.square(nyquist) / FILTER_VARIANCE
     variances = np.exp(2 * host.log_scales.astype(np.float64))
     left = np.maximum(variances - taken[:, None], MIN_VARIANCE_SHARE * variances)
     baked = replace(host, log_scales=(np.log(left) / 2).astype(np.float32))
     before = _integrals(gaussians, cameras, fitted)
-    after = _integrals(baked.to(type(gaussians.means)), cameras, VIEWER_APPROXIMATIONS)
+    after = _integrals(baked.to(type(gaussians.means)), cameras, shown)
     factor = np.divide(before, after, out=np.ones_like(after), where=after > 0)
     opacities = factor / (1 + np.exp(-host.logit_opacities.astype(np.float64)))
     return replace(baked, logit_opacities=_finite_logits(opacities))

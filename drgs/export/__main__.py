@@ -29,16 +29,12 @@ from drgs.export.levels import LOD_META, encode_levels
 from drgs.export.operations import add_operations, apply_steps, reduce_to, turn_up
 from drgs.export.source import Z_UP, ExportSource, Honoured, load_source, merge_sources
 from drgs.io import sog
-from drgs.io.formats import format_for, writable_formats
+from drgs.io.formats import PLAYCANVAS, Scalar, format_for, writable_formats
 from drgs.results.html_viewer import HONOURED, DisplaySettings, InitialView, viewer_page
 
 COMMAND = "export"
 
 Y_DOWN = np.array([0.0, -1.0, 0.0])  # of formats without axes: COLMAP's, hence the reference's
-
-PLAYCANVAS_LOW_PASS = 0.075  # px^2, of PlayCanvas and SuperSplat; others add 0.3
-
-PLAYCANVAS = ("compressed-ply", "sog")  # formats that are read by them
 
 DEFAULT_LEVELS, NUM_LEVELS = 4, (2, 8)
 
@@ -49,9 +45,10 @@ NEEDED["json"] = "--info"
 """Options that belong to another one, by the name of their argument."""
 
 
-def _honoured_by_playcanvas(fitted: Approximations) -> frozenset[str]:
-    ours = abs(fitted.low_pass - PLAYCANVAS_LOW_PASS)
-    return HONOURED if ours < abs(fitted.low_pass - LOW_PASS) else frozenset()
+def _honoured_where(shown_with: Mapping[str, Scalar], fitted: Approximations) -> frozenset[str]:
+    shown = Approximations.from_values(shown_with)
+    is_nearer = abs(fitted.low_pass - shown.low_pass) < abs(fitted.low_pass - LOW_PASS)
+    return HONOURED if is_nearer else frozenset()
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,7 @@ def targets() -> dict[str, ExportTarget]:
             encode=partial(_encode_format, each.name),
             up=Y_DOWN if each.value.up is None else Z_UP,
             has_axes=each.value.up is not None,
-            honoured=_honoured_by_playcanvas if each.name in PLAYCANVAS else None,
+            honoured=partial(_honoured_where, each.value.shown_with),
         )
         for each in writable_formats()
     }
@@ -127,6 +124,7 @@ def _honour_all(_: Approximations) -> frozenset[str]:
     return frozenset(DECLARED)
 
 
+_honoured_in_playcanvas = partial(_honoured_where, PLAYCANVAS)
 _LOD = f"levels of detail as PlayCanvas streams them, {LOD_META} beside folders of SOG"
 _PAGE = "a page to walk around in, for any browser"
 _MESH = "the surface as triangles with colours (.ply or .glb)"
@@ -134,7 +132,7 @@ MADE_TARGETS = {
     "html": ExportTarget(".html", _PAGE, _encode_page, Z_UP, False, lambda _: HONOURED),
     "mesh": ExportTarget(".ply", _MESH, _encode_mesh, Z_UP, False, _honour_all),
     "lod": ExportTarget(
-        f"_levels/{LOD_META}", _LOD, _encode_levels, Y_DOWN, False, _honoured_by_playcanvas
+        f"_levels/{LOD_META}", _LOD, _encode_levels, Y_DOWN, False, _honoured_in_playcanvas
     ),
 }
 STATISTICS_ONLY = ExportTarget("", "no file", lambda *_: {}, Z_UP, False, _honour_all)

@@ -30,7 +30,6 @@ from drgs.core.registry import reporting_extensions
 from drgs.datasets import Dataset, load_dataset
 from drgs.datasets.folders import config_for
 from drgs.effects.base import ChosenEffects, Examiner, TrainingEffect
-from drgs.effects.smoothing import bake_smoothing
 from drgs.fit.budget import Budget, Plan, deadline, plan_fit, rehearse
 from drgs.fit.checkpoint import Checkpoint, check_fits, check_same_data, save_checkpoint
 from drgs.fit.fingerprint import Fingerprint, fingerprint_of
@@ -321,19 +320,18 @@ class FitSession:
         if not config.model.approximations.is_default:
             others[GAUSSIANS] = self._fit_for_viewers(for_viewers, gaussians)
         if name := small_file_name(config):
-            start = others[GAUSSIANS].gaussians if others else bake_smoothing(gaussians)
-            others[name] = self._fit_for_viewers(fit_small_file, start)
+            others[name] = self._fit_for_viewers(fit_small_file, gaussians)
         if self.folder is not None:
             results = trainer, self.history, gaussians, others, wall_s
             metrics = self.folder.write_results(*results)
             self._print(self.folder.describe(metrics))
 
-    def _fit_for_viewers(self, fit: Callable[..., ForViewers], start: Gaussians) -> ForViewers:
+    def _fit_for_viewers(self, fit: Callable[..., ForViewers], gaussians: Gaussians) -> ForViewers:
         """Return Gaussians for other viewers; the trainer is released, and renders the fit's."""
         if not self.uses_terminal:
-            return fit(self.trainer, start)
+            return fit(self.trainer, gaussians)
         with RunProgress("iteration for viewers") as shown:
-            return fit(self.trainer, start, shown.update)
+            return fit(self.trainer, gaussians, shown.update)
 
 
 @dataclass(frozen=True)

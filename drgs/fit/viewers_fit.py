@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from drgs.config.approximations import DECLARED
+from drgs.config.approximations import DECLARED, Approximations
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig, ModelConfig
 from drgs.core.errors import UserError, note_user, one_line
@@ -31,7 +31,7 @@ from drgs.effects.smoothing import bake_for_viewers, bake_smoothing
 from drgs.fit.inputs import share_gaussians
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene, render_views
-from drgs.io.formats import FORMATS
+from drgs.io.formats import FORMATS, FileFormat
 from drgs.results.folder import small_file_names
 from drgs.training.rates import TOUCH_UP_RATES
 from drgs.training.trainer import StepReport, Trainer
@@ -83,7 +83,7 @@ def for_viewers(
     If it fails, the closed form is returned, with a :class:`UserNote`.
     """
     others = trainer.config.model.approximations.non_default
-    start = _closed_form(trainer, gaussians)
+    start = _closed_form(trainer, gaussians, Approximations())
     start = replace(start, rendered_with={name: DECLARED[name].default for name in others})
     further = tuning(trainer.config, num_iterations(trainer.config))
     return _fit_further(trainer, further, start, Trainer.step, watch)
@@ -102,23 +102,25 @@ def small_file_name(config: FitConfig) -> str | None:
 
 
 def fit_small_file(
-    trainer: Trainer, start: Gaussians, watch: Watch = lambda *_: None
+    trainer: Trainer, gaussians: Gaussians, watch: Watch = lambda *_: None
 ) -> ForViewers:
-    """Fit Gaussians for viewers as ``output.small_file`` rounds them; they are rounded.
+    """Fit a copy of a fit's Gaussians as ``output.small_file`` rounds them; they are rounded.
 
-    start: those of the larger file; trainer, watch: as for :func:`for_viewers`. Several processes
-    do not fit it: then numbers are as they were.
+    They are rendered as by the format's viewers (``shown_with`` of the format). The arguments are
+    those of :func:`for_viewers`. Several processes only change them in closed form.
     """
     assert trainer.config.output.small_file is not None
-    start = replace(start, rendered_with=None)
+    file_format = FORMATS.get(trainer.config.output.small_file).value()
     further = tuning(trainer.config, ROUNDED_ITERATIONS)
-    rate = HARMONICS_FACTOR * further.optimizer.shN_lr
-    further = with_changes(further, {"optimizer.shN_lr": rate})
+    changes = {f"model.{name}": value for name, value in file_format.shown_with.items()}
+    changes["optimizer.shN_lr"] = HARMONICS_FACTOR * further.optimizer.shN_lr
+    further = with_changes(further, changes)
+    start = _closed_form(trainer, gaussians, further.model.approximations)
     if trainer.comm.size > 1:
         note_user("output.small_file: several processes do not fit it; it is larger, and worse")
         effects, background = trainer.effects, trainer.dataset.background
         return ForViewers(start, further.model, background, effects)
-    steps = _RoundedSteps(start, trainer.config.output.small_file)
+    steps = _RoundedSteps(start, file_format)
     return _fit_further(trainer, further, replace(start, **steps.rounded), steps, watch)
 
 
@@ -129,9 +131,9 @@ class _RoundedSteps:
     estimator of Bengio et al. 2013, arXiv:1308.3432.
     """
 
-    def __init__(self, start: Gaussians, format_name: str) -> None:
+    def __init__(self, start: Gaussians, file_format: FileFormat) -> None:
         self._values = {name: np.array(getattr(start, name)) for name in PARAMETER_NAMES}
-        self._round = FORMATS.get(format_name).value().rounding(self._values)
+        self._round = file_format.rounding(self._values)
         self.rounded = self._round_values()
 
     def _round_values(self) -> dict[str, np.ndarray]:
@@ -171,12 +173,13 @@ def _fit_further(
     return ForViewers(tuned, further.model, trainer.dataset.background, trainer.effects)
 
 
-def _closed_form(trainer: Trainer, gaussians: Gaussians) -> Gaussians:
+def _closed_form(trainer: Trainer, gaussians: Gaussians, shown: Approximations) -> Gaussians:
     """Return Gaussians in closed form, by the training cameras as the fit has them."""
     on_device = bake_smoothing(gaussians).to(mi.TensorXf)
     with dr.suspend_grad():
         cameras = trainer.fit_state().cameras()
-        return bake_for_viewers(on_device, cameras, trainer.config.model.approximations)
+        baked = bake_for_viewers(on_device, cameras, trainer.config.model.approximations, shown)
+        return replace(baked, rendered_with=None)
 
 
 def tuning(config: FitConfig, iterations: int) -> FitConfig:

@@ -24,7 +24,7 @@ import numpy as np
 from typing_extensions import override
 
 from drgs.core.errors import UserError
-from drgs.io.formats import FORMATS, Arrays, FileFormat, Scalar
+from drgs.io.formats import FORMATS, PLAYCANVAS, Arrays, FileFormat, Scalar
 from drgs.io.ply import NUM_REST, encode_elements, has_packed_vertices, read_elements
 from drgs.io.quantization import (
     colors_from_sh0,
@@ -70,6 +70,7 @@ class CompressedPly(FileFormat):
     suffix = ".compressed.ply"
     description = "PlayCanvas's compressed PLY, for SuperSplat and PlayCanvas"
     metadata = None
+    shown_with = PLAYCANVAS
     ranges = MappingProxyType(
         {"shN": (-SH_RANGE, SH_RANGE), "log_scales": (-MAX_LOG_SCALE, MAX_LOG_SCALE)}
     )

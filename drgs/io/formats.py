@@ -44,6 +44,9 @@ Rounding = Callable[[Arrays], Arrays]
 
 ORIGIN = ("origin_x", "origin_y", "origin_z")  # in ``rendered_with``: world, of the means
 
+PLAYCANVAS = MappingProxyType({"low_pass": 0.075})
+"""Approximations of PlayCanvas and SuperSplat; low_pass in px^2, which others take for 0.3."""
+
 UP = "up"  # in ``rendered_with`` of a file that records its axis: ``"y"`` or ``"z"``
 
 MAX_ORIGIN = 1e12  # world units
@@ -76,6 +79,9 @@ class FileFormat:
 
     metadata: frozenset[str] | None = frozenset()
     """Names of ``rendered_with`` that files can record; None: all. Notes report the others."""
+
+    shown_with: Mapping[str, Scalar] = MappingProxyType({})
+    """Approximations of the programs that read the format, where others than the defaults."""
 
     ranges: Mapping[str, tuple[float, float]] = MappingProxyType({})
     """Smallest and largest value of arrays, by name; :meth:`encode` cuts off what is beyond, and a

@@ -38,7 +38,7 @@ from drgs.config.section import parse_json, validate
 from drgs.core.errors import UserError, one_line
 from drgs.core.files import open_regular, read_bytes, refuse_damage
 from drgs.core.memory import require_memory
-from drgs.io.formats import FORMATS, Arrays, FileFormat, Rounding, Scalar
+from drgs.io.formats import FORMATS, PLAYCANVAS, Arrays, FileFormat, Rounding, Scalar
 from drgs.io.quantization import (
     drop_largest_component,
     logits_from_opacities,
@@ -80,6 +80,7 @@ class Sog(FileFormat):
     other_names = frozenset({META, LOD_META})
     description = "PlayCanvas's SOG, for SuperSplat and PlayCanvas"
     metadata = frozenset({"antialiased"})
+    shown_with = PLAYCANVAS
 
     @override
     def read(self, path: Path) -> tuple[Arrays, Mapping[str, Scalar]]:

@@ -342,7 +342,8 @@ class Trainer:
             begins_phase=step.begins_phase,
             rate_decay=self.rates.means(iteration) / self.rates.means.initial,
             integrator=self.integrator,
-            means=cast(TensorXf, self.optimizer["means"]),
+            # The scene's, once the optimizer is released.
+            means=cast(TensorXf, self.parameters.get("means", self.params["means"])),
             views=step.phase.views,
             effects=self.effects,
         )

@@ -8,6 +8,7 @@ from support import small_fits as fits
 from support.small_capture import decibels
 from support.viewer_rendering import VIEWER_RENDERING
 
+from drgs.config.approximations import Approximations
 from drgs.config.changes import with_changes
 from drgs.config.schema import ModelConfig
 from drgs.core.errors import UserNote
@@ -78,7 +79,8 @@ def test_refined_cameras_and_colours_are_kept():
 
 def test_nonfinite_values_fall_back_to_the_closed_form(monkeypatch):
     trainer, _, gaussians = ended_fit(8)
-    expected = viewers._closed_form(trainer, gaussians)  # private: what no iteration has changed
+    # Private: what no iteration has changed.
+    expected = viewers._closed_form(trainer, gaussians, Approximations())
     monkeypatch.setitem(viewers.TOUCH_UP_RATES, "scales_lr", 10.0)
     monkeypatch.setattr(viewers, "ITERATIONS_SHARE", 0.5)
     step = Trainer.step
