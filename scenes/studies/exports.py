@@ -42,6 +42,8 @@ from drgs.training.trainer import Trainer
 
 COLUMNS = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
 
+TICKS = (15, 20, 30, 40, 60, 100, 250)
+
 SMALL = "-sog"  # before the share of entries of a palette
 
 SHARES = (1 / 100, 1 / 24, 1 / 12, 1 / 8, 1 / 6, 1 / 4, 1 / 2)
@@ -76,8 +78,11 @@ def write_results(rows: list[list[str | float]], folder: Path) -> None:
     for name, point in points.items():
         if not name.startswith(SMALL):
             axes.plot(*point, "x", color="black")
-            axes.annotate(name, point, (4, 4), textcoords="offset points")
+            above = {"ply": 16, "usd": 28}.get(name, 4)  # beside glb
+            axes.annotate(name, point, (-8, above), textcoords="offset points")
     axes.set_xscale("log")
+    axes.set_xticks(TICKS, map(str, TICKS))
+    axes.minorticks_off()
     axes.set_xlabel("bytes per Gaussian")
     axes.set_ylabel("PSNR of the test views, as viewers show them [dB]")
     axes.legend()
