@@ -298,8 +298,8 @@ class OutputConfig(Section):
     report: bool = True
     """Write report.html, viewer.html, side_by_side/, curves.png and the orbit."""
     small_file: str | None = None
-    """Format of a further file, as sog: point_cloud.sog is what other viewers show after 250 more
-    iterations, in which numbers are rounded as in the file. null: none."""
+    """Format of a further file, sog: point_cloud.sog has Gaussians that were fitted 250 iterations
+    further as its viewers render, with its rounding (by one process). null: none."""
     history_every: Count = Field(10, ge=1)
     """Iterations between rows of history.csv."""
     checkpoint_every: Count | None = Field(500, ge=1)

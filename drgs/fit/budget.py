@@ -32,7 +32,7 @@ from drgs.fit.inputs import share_inputs
 from drgs.fit.loop import Continues
 from drgs.fit.memory import room_for_targets
 from drgs.fit.report import seconds_of_results
-from drgs.fit.viewers_fit import SMALL_FILE_TIME_SHARE, TIME_SHARE
+from drgs.fit.viewers_fit import ROUNDED_ITERATIONS, ROUNDING_SECONDS, TIME_SHARE
 from drgs.gaussians.parameters import Gaussians
 from drgs.training.contracts import NO_PARTS, GivenParts
 from drgs.training.parallel.communicator import Communicator
@@ -300,9 +300,9 @@ def plan_fit(
     if not config.model.approximations.is_default:
         end -= results.viewers
         end -= TIME_SHARE * max(0.0, end - time.perf_counter())
-    if config.output.small_file is not None:
-        end -= results.viewers
-        end -= SMALL_FILE_TIME_SHARE * max(0.0, end - time.perf_counter())
+    if config.output.small_file is not None:  # whose iterations are as the last ones
+        iteration_s = 2 * start_s + ROUNDING_SECONDS * max(num_points, most)
+        end -= results.viewers + ROUNDED_ITERATIONS * iteration_s
     side = min(min(view.width, view.height) for view in dataset.train)
     plan = make_plan(config, num_points, side, end - time.perf_counter(), start_s, load_curves())
     return replace(plan, end=end)

@@ -179,15 +179,17 @@ class FitFolder:
         test = SplitMetrics(**vars(mean_of(scores)), split=split)
         metrics = self._metrics(config, gaussians.num_gaussians, wall_s, test)
         for name, each in for_viewers.items():
+            if name != folder.GAUSSIANS:
+                each.gaussians.save(out / name)
+                each = replace(each, gaussians=Gaussians.load(out / name))
             views = evenly_spaced(dataset.test, MAX_PICTURES)
             images = zip(each.images(views), views, strict=True)
             quality = mean_quality((image, view.image, view.mask) for image, view in images)
             found = SplitMetrics(**vars(quality), split=split)
             if name == folder.GAUSSIANS:
                 metrics["viewers"] = found
-                continue
-            each.gaussians.save(out / name)
-            metrics["small_file"] = {**found, "bytes": (out / name).stat().st_size}
+            else:
+                metrics["small_file"] = {**found, "bytes": (out / name).stat().st_size}
         if output.report:
             approximations = config.model.approximations
             shown = DisplaySettings(bake_smoothing(gaussians), approximations)
@@ -239,7 +241,7 @@ class FitFolder:
             lines.append(f"as other viewers show {path}: PSNR {viewers['psnr']:.2f} dB")
         if (small := metrics.get("small_file")) is not None:
             size = f"{small['bytes'] / 1e6:.2f} MB"
-            lines.append(f"as they show the small file, {size}: PSNR {small['psnr']:.2f} dB")
+            lines.append(f"as its viewers show the small file, {size}: PSNR {small['psnr']:.2f} dB")
         lines.append(f"written: {self.path}")
         if cast("dict[str, object]", metrics["config"]["output"])["report"]:
             lines.append(f"open {self.path / folder.REPORT}")

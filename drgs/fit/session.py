@@ -47,13 +47,13 @@ from drgs.fit.loop import (
 )
 from drgs.fit.memory import room_for_targets
 from drgs.fit.summary import summary_of_fit
-from drgs.fit.viewers_fit import ForViewers, fit_small_file, for_viewers, small_file_name
+from drgs.fit.viewers_fit import ForViewers, fit_small_file, for_viewers
 from drgs.gaussians.parameters import Gaussians
 from drgs.initialization.defaults import resolve_defaults
 from drgs.initialization.start import description_of_start, gaussians_at, start_of
 from drgs.integrator.scene import check_lenses
 from drgs.integrator.summary import format_effects
-from drgs.results.folder import BUDGET_PLAN, EXAMINATION, GAUSSIANS
+from drgs.results.folder import BUDGET_PLAN, EXAMINATION, GAUSSIANS, small_file_name
 from drgs.results.history import HistoryRow
 from drgs.training.contracts import NO_PARTS, GivenParts
 from drgs.training.density.strategy import DensityStrategy
@@ -353,7 +353,7 @@ def train(
     loss: Loss | None = None,
     terms: Sequence[LossTerm] = (),
 ) -> FitResult:
-    """Fit Gaussians to photographs, in memory: the bytes that ``drgs fit`` writes to its PLY file.
+    """Fit Gaussians to photographs, in memory: the bytes that ``drgs fit`` writes as its own.
 
     config: the path of a YAML file, or of a dataset's folder (``drgs.datasets.folders`` chooses the
     configuration, and :func:`drgs.examine` the effects if the folder is all that is given); nested

@@ -22,7 +22,7 @@ import numpy as np
 from drgs.config.approximations import DECLARED, Approximations
 from drgs.config.changes import with_changes
 from drgs.config.schema import FitConfig, ModelConfig
-from drgs.core.errors import UserError, note_user, one_line
+from drgs.core.errors import UserError, note_user
 from drgs.core.memory import release_unused_memory
 from drgs.datasets.types import View
 from drgs.effects.base import TrainingEffect
@@ -32,15 +32,15 @@ from drgs.fit.inputs import share_gaussians
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
 from drgs.integrator.scene import make_scene, render_views
 from drgs.io.formats import FORMATS, FileFormat
-from drgs.results.folder import small_file_names
 from drgs.training.rates import TOUCH_UP_RATES
 from drgs.training.trainer import StepReport, Trainer
 
 ITERATIONS_SHARE, TIME_SHARE = 0.08, 0.12
 """Share of the fit's iterations, and of its time: late iterations take longer."""
 
-ROUNDED_ITERATIONS, SMALL_FILE_TIME_SHARE = 250, 0.2
-"""Iterations with rounded numbers, and their share of the time of a fit that has few itself."""
+ROUNDED_ITERATIONS = 250
+
+ROUNDING_SECONDS = 1e-6  # per Gaussian and iteration, on the host
 
 HARMONICS_FACTOR = 4
 """Times the rate of harmonics, where a file shares them among Gaussians: steps are averaged."""
@@ -89,18 +89,6 @@ def for_viewers(
     return _fit_further(trainer, further, start, Trainer.step, watch)
 
 
-def small_file_name(config: FitConfig) -> str | None:
-    """Return the name of ``output.small_file``; raise :class:`UserError` for another format."""
-    if (name := config.output.small_file) is None:
-        return None
-    if name not in (names := small_file_names()):
-        raise UserError(
-            f"output.small_file: must be one of {', '.join(names)}, or null, got {one_line(name)}; "
-            "drgs export writes other formats"
-        )
-    return names[name]
-
-
 def fit_small_file(
     trainer: Trainer, gaussians: Gaussians, watch: Watch = lambda *_: None
 ) -> ForViewers:
@@ -117,7 +105,8 @@ def fit_small_file(
     further = with_changes(further, changes)
     start = _closed_form(trainer, gaussians, further.model.approximations)
     if trainer.comm.size > 1:
-        note_user("output.small_file: several processes do not fit it; it is larger, and worse")
+        if trainer.comm.is_root:
+            note_user("output.small_file: several processes write it without fitting it")
         effects, background = trainer.effects, trainer.dataset.background
         return ForViewers(start, further.model, background, effects)
     steps = _RoundedSteps(start, file_format)
@@ -143,6 +132,8 @@ class _RoundedSteps:
         report, former = trainer.step(), self.rounded
         for name, value in trainer.parameters.items():
             self._values[name] += np.array(value) - former[name]
+            if not np.isfinite(self._values[name]).all():  # which rounding may hide
+                raise UserError(f"{name}: a number is not finite")
         self.rounded = self._round_values()
         for name, value in trainer.parameters.items():
             trainer.optimizer[name] = type(value)(self.rounded[name])

@@ -107,9 +107,10 @@ class FileFormat:
         raise UserError("files of this format can be read, but not written")
 
     def rounding(self, gaussians: Arrays) -> Rounding:
-        """Return how files round Gaussians like these, so that fits can take part in it.
+        """Return how files round Gaussians like these, so that a fit can take part in it.
 
-        :meth:`encode` keeps what was rounded once. Optional: see ``output.small_file``.
+        Optional, for ``output.small_file``, and formats without :attr:`up`. :meth:`encode` keeps
+        what was rounded once.
         """
         raise UserError("fits do not know how files of this format are rounded")
 

@@ -131,13 +131,15 @@ class Sog(FileFormat):
     def rounding(self, gaussians: Arrays) -> Rounding:
         """Return rounding with these Gaussians' bounds, codebooks, and choice in a small palette.
 
-        Entries of the palette are the mean harmonics of those that have chosen them.
+        Entries of the palette are the mean harmonics of those that have chosen them. Quaternions
+        keep their lengths and signs, which files do not have.
         """
         num = len(gaussians["means"])
         low, high = _bounds(gaussians["means"])
         codes = {name: _codebook(gaussians[name])[0] for name in ("log_scales", "sh0")}
         rows = gaussians["shN"].reshape(num, -1)
-        _, labels = _palette(rows, max(CELLS, round(FITTED_SHARE * num)))
+        most = min(MAX_PALETTE, max(CELLS, round(FITTED_SHARE * num)))
+        _, labels = _palette(rows, most)
         order = np.argsort(labels, kind="stable")
         starts = np.flatnonzero(np.diff(labels[order], prepend=-1))
         sizes = np.diff(starts, append=num)[:, None].astype(np.float32)
@@ -149,10 +151,13 @@ class Sog(FileFormat):
 
         def round_values(g: Arrays) -> Arrays:
             opacities = _opacity_levels(g["logit_opacities"]) / 255
+            quats = g["quats"]
+            lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+            largest = np.take_along_axis(quats, np.abs(quats).argmax(axis=1)[:, None], axis=1)
             palette = harmonics[_nearest(harmonics, entries(g))]
             return {
                 "means": _means(_mean_levels(g["means"], low, high), low, high),
-                "quats": _quaternions(_quaternion_levels(g["quats"])),
+                "quats": _quaternions(_quaternion_levels(quats)) * np.copysign(lengths, largest),
                 **{name: code[_nearest(code, g[name])] for name, code in codes.items()},
                 "logit_opacities": logits_from_opacities(opacities),
                 "shN": palette[labels].reshape(g["shN"].shape),
@@ -165,7 +170,7 @@ class Sog(FileFormat):
         """Return an archive of the Gaussians in Morton order.
 
         Up to 65,536 different harmonics have an entry each in the palette, and up to 256 different
-        numbers one in a codebook: what was rounded before stays as it is.
+        numbers one in a codebook, so that they stay as they are if they were rounded before.
         """
         order = morton_order(gaussians["means"])
         ordered = {name: values[order] for name, values in gaussians.items()}
@@ -406,7 +411,7 @@ def _palette(rows: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Return at most ``most`` rows (P, D) that stand for rows (N, D), and their indices (N,).
 
     k-means in parts of the space, which are k-means clusters themselves, from rows at equal
-    distances in Morton order: deterministic. A part has entries in proportion to its variance.
+    distances in their order: deterministic. A part has entries in proportion to its variance.
     """
     distinct, inverse = np.unique(rows, axis=0, return_inverse=True)
     labels = inverse.reshape(-1)

@@ -29,7 +29,7 @@ from drgs.io.formats import fitted_formats
 
 CONFIG = "config.yml"  # every value of the configuration; marks whose folder it is
 CHECKPOINT = "checkpoint.npz"  # while the fit runs: see :mod:`drgs.fit.checkpoint`
-GAUSSIANS = "point_cloud.ply"  # as any viewer renders; in earlier versions, as the fit does
+GAUSSIANS = "point_cloud.ply"  # as most viewers render; in earlier versions, as the fit does
 OWN_GAUSSIANS = "point_cloud_drgs.ply"  # as the fit renders, if viewers do otherwise
 EARLIER_FOR_VIEWERS = "point_cloud_viewers.ply"  # of earlier versions
 HISTORY = "history.csv"
@@ -51,18 +51,33 @@ ERROR_BUDGET = "error_budget.json"  # of ``drgs render --error``
 
 def result_names() -> list[str]:
     """Return the files of a fit but for ``config.yml``, with those of effects."""
+    return [*_names_without_small_files(), *small_file_names().values()]
+
+
+def _names_without_small_files() -> list[str]:
     names = []
     for each in EFFECTS.all():
         names += each.value.files or [f"{each.name}.json"] * each.value.has_numbers
     names += [CHECKPOINT, CURVES, DENSITY, EXAMINATION, HISTORY, METRICS, ORBIT, ORBIT_GIF]
     names += [BUDGET_PLAN, CAMERAS, RENDERS, REPORT, SIDE_BY_SIDE, VIEWER, VIEWS]
-    names += small_file_names().values()
     return [*names, GAUSSIANS, OWN_GAUSSIANS, EARLIER_FOR_VIEWERS]
 
 
 def small_file_names() -> dict[str, str]:
     """Return the names of the files of ``output.small_file``, by format."""
     return {each.name: f"point_cloud{each.value.suffix}" for each in fitted_formats()}
+
+
+def small_file_name(config: FitConfig) -> str | None:
+    """Return the name of ``output.small_file``; raise :class:`UserError` for another format."""
+    if (name := config.output.small_file) is None:
+        return None
+    if name not in (names := small_file_names()):
+        raise UserError(
+            f"output.small_file: must be one of {', '.join(names)}, or null, got {one_line(name)}; "
+            "drgs export writes other formats"
+        )
+    return names[name]
 
 
 def own_gaussians(folder: Path) -> Path:
@@ -124,7 +139,7 @@ def check_output_folder(folder: Path, config: FitConfig, images: Sequence[str] =
             f"{folder}: already holds another run, {differences}; choose another folder with "
             f"--out, continue that run with --resume {folder}, or replace it with --overwrite"
         )
-    record.check(_file_names(images), earlier=_file_names(images))
+    record.check(names := _file_names(images, config), earlier=names)
 
 
 def continue_run(folder: Path, config: FitConfig, images: Sequence[str] = ()) -> None:
@@ -132,7 +147,7 @@ def continue_run(folder: Path, config: FitConfig, images: Sequence[str] = ()) ->
 
     Raises :class:`UserError` if foreign files would be replaced.
     """
-    record, names = FolderRecord(folder, COMMAND), _file_names(images)
+    record, names = FolderRecord(folder, COMMAND), _file_names(images, config)
     record.check(names, earlier=names)
     remove_stale_temporaries(folder)
     paths = {
@@ -269,7 +284,7 @@ def _check_removable(
     if record.exists:
         foreign += record.foreign_files(files)
     else:
-        known = set(_file_names(images))
+        known = {*result_names(), *images}
         paths = {name: folder / name for name in files}
         regular = {name for name, path in paths.items() if path.is_file() and not path.is_symlink()}
         foreign += [name for name in files if name not in known & regular]
@@ -296,9 +311,11 @@ def _files(folder: Path) -> Iterator[str]:
             yield from ((Path(inside).relative_to(folder) / file).as_posix() for file in kept)
 
 
-def _file_names(images: Sequence[str]) -> list[str]:
+def _file_names(images: Sequence[str], config: FitConfig) -> list[str]:
     """Return the files that a fit writes, except ``config.yml``, whose content is checked."""
-    return [*(name for name in result_names() if name not in FOLDERS), *images]
+    small_file = small_file_name(config)
+    names = [*_names_without_small_files(), *([small_file] if small_file else [])]
+    return [*(name for name in names if name not in FOLDERS), *images]
 
 
 def _visible_names(folder: Path) -> list[str]:

@@ -111,6 +111,27 @@ def test_a_palette_stands_for_more_gaussians_than_it_has_entries(monkeypatch):
     assert error.mean() < 0.2 * np.square(rows - rows.mean(axis=0)).sum(axis=1).mean()
 
 
+def test_rounded_values_are_near_and_are_kept_by_the_file(tmp_path, monkeypatch):
+    """Nearer than steps of the codes; quaternions with their own signs and lengths."""
+    monkeypatch.setattr(sog, "MAX_PALETTE", 30)
+    monkeypatch.setattr(sog, "CELLS", 4)
+    monkeypatch.setattr(sog, "FITTED_SHARE", 0.5)
+    g = gaussians_within_ranges(100)
+    values = {n: getattr(g, n) for n in PARAMETER_NAMES}
+    values["quats"] = values["quats"] * np.linspace(-3, 2, 100)[:, None].astype(np.float32)
+    rounded = sog.Sog().rounding(values)(values)
+    lengths = np.linalg.norm(values["quats"], axis=1, keepdims=True)
+    # Half a step of 1/sqrt(2)/127.5 in three components, and what they leave for the largest.
+    assert (np.abs(rounded["quats"] - values["quats"]) <= 0.012 * lengths).all()
+    assert np.abs(rounded["means"] - values["means"]).max() < np.ptp(values["means"]) * 1e-4
+    rows = np.unique(rounded["shN"].reshape(100, -1), axis=0)
+    assert len(rows) <= 30
+    Gaussians(**{n: v.astype(np.float32) for n, v in rounded.items()}).save(tmp_path / "a.sog")
+    monkeypatch.undo()  # readers have the true limits
+    read = np.unique(Gaussians.load(tmp_path / "a.sog").shN.reshape(100, -1), axis=0)
+    np.testing.assert_array_equal(read, rows.astype(np.float32))
+
+
 def test_gaussians_that_are_all_alike_are_kept(tmp_path):
     one = gaussians_within_ranges(1)
     same = {n: np.repeat(getattr(one, n), 5, axis=0) for n in PARAMETER_NAMES}

@@ -18,6 +18,7 @@ from drgs.results.folder import (
     METRICS,
     check_output_folder,
     claim_output_folder,
+    continue_run,
     image_names,
     is_finished,
     load_run_config,
@@ -137,7 +138,7 @@ def test_other_runs_and_foreign_files_are_refused_and_kept(tmp_path, finished, c
 def test_removing_a_run_deletes_every_result(tmp_path, config):
     remove_run(tmp_path / "none")
     remove_run(tmp_path)
-    claim_output_folder(tmp_path, config)
+    claim_output_folder(tmp_path, with_changes(config, {"output.small_file": "sog"}))
     for name in result_names():
         if name in FOLDERS:
             (tmp_path / name / "empty").mkdir(parents=True)
@@ -145,6 +146,17 @@ def test_removing_a_run_deletes_every_result(tmp_path, config):
             (tmp_path / name).write_text("")
     remove_run(tmp_path)
     assert os.listdir(tmp_path) == []
+
+
+def test_exported_file_with_the_name_of_a_small_one_is_kept(finished, config):
+    """It is in the way of a fit that would write it, and of no other."""
+    (finished / "point_cloud.sog").write_text("mine")
+    claim_output_folder(finished, config)
+    small = with_changes(config, {"output.small_file": "sog"})
+    assert_refused(
+        "point_cloud.sog, which this command would replace", continue_run, finished, small
+    )
+    assert_refused("got point_cloud.sog", remove_run, finished)
 
 
 @pytest.mark.parametrize("is_recorded", [True, False])
