@@ -60,6 +60,7 @@ def test_configurations_and_images_of_scenes_stay_the_same():
     sections = {**values, "prune": values["densify"]["prune"]}
     assert all(sections[section].pop(name) for section in removed for name in removed[section])
     assert loaded["init"].pop("gaussians") is None and loaded["init"].pop("sky") is True
+    assert loaded["output"].pop("small_file") is None
     newer = [loaded["data"].pop(key) for key in ("leave_out", "in_memory")]
     assert [*newer, loaded["densify"].pop("remove_floaters")] == [[], None, True]
     newer = [loaded["colors"].pop(f"{name}_lr") for name in ("vignetting", "response")]
