@@ -45,6 +45,10 @@ class FolderRecord:
         """Paths relative to the folder, by key of a configuration."""
         return self._content.paths
 
+    def has_written(self, name: str) -> bool:
+        """Return whether the file was there when the command ended."""
+        return bool(self._content.files.get(name))
+
     def foreign_files(self, names: Iterable[str]) -> list[str]:
         """Return those ``names``, relative to the folder, whose files are foreign."""
         return [name for name in names if self._is_foreign(name)]

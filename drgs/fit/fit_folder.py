@@ -20,7 +20,7 @@ from drgs.config.changes import given_keys, with_changes
 from drgs.config.schema import FitConfig
 from drgs.core.environment import processor
 from drgs.core.errors import UserError
-from drgs.core.files import atomic_path, write_json
+from drgs.core.files import atomic_path, refusal_reason, write_json
 from drgs.core.folders import FolderRecord, sole_writer
 from drgs.datasets.types import Dataset, evenly_spaced
 from drgs.effects.smoothing import bake_smoothing
@@ -272,4 +272,8 @@ def write_gaussians(out: Path, own: Gaussians, for_viewers: Gaussians) -> None:
         own.save(out / folder.OWN_GAUSSIANS)
     for_viewers.save(out / folder.GAUSSIANS)
     for name in (folder.EARLIER_FOR_VIEWERS, *(() if differ else (folder.OWN_GAUSSIANS,))):
-        (out / name).unlink(missing_ok=True)
+        try:
+            (out / name).unlink(missing_ok=True)
+        except OSError as error:
+            reason = refusal_reason(error)
+            raise UserError(f"{out / name}: cannot be removed: {reason}") from error

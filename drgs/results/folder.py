@@ -81,8 +81,13 @@ def small_file_name(config: FitConfig) -> str | None:
 
 
 def own_gaussians(folder: Path) -> Path:
-    """Return the file of a fit's own Gaussians, which drgs renders as the fit does."""
-    return path if (path := folder / OWN_GAUSSIANS).is_file() else folder / GAUSSIANS
+    """Return the file of a fit's own Gaussians, which drgs renders as the fit does.
+
+    It may be missing: no other file takes the place of one that the fit has written.
+    """
+    path = folder / OWN_GAUSSIANS
+    has_own = path.is_file() or FolderRecord(folder, COMMAND).has_written(OWN_GAUSSIANS)
+    return path if has_own else folder / GAUSSIANS
 
 
 def viewer_gaussians(folder: Path) -> Path:

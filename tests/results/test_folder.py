@@ -171,6 +171,7 @@ def test_folder_in_place_of_a_result_is_not_removed(finished, is_recorded):
 EFFECT_NAMES = {f"effects/{e.name}.py": set(e.value.files) for e in EFFECTS.all()}
 
 OTHER_NAMES = {files.CONFIG, *result_names()} - set().union(*EFFECT_NAMES.values())
+OTHER_NAMES -= set(files.small_file_names().values())  # made of a format's suffix
 
 ALLOWED_NAMES = {
     "results/folder.py": OTHER_NAMES,

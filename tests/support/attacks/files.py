@@ -51,7 +51,7 @@ READERS = {
     "camera.json": ("render", "gaussians.ply", "--camera", "camera.json", "--out", "out"),
     "sky.png": ("render", "gaussians.ply", *CAMERA, "--background", "sky.png"),
     "run/config.yml": RUN,
-    "run/point_cloud.ply": RUN,
+    "run/point_cloud_drgs.ply": RUN,
     "stopped/config.yml": RESUME,
     "stopped/checkpoint.npz": RESUME,
     "splats.xml": ("render", "splats.xml", "--out", "out"),

@@ -64,8 +64,9 @@ COMMANDS = {
 
 FOREIGN = """
     config.yml metrics.json point_cloud.ply checkpoint.npz report.html viewer.html plan.txt
-    history.csv density.csv cameras.json orbit.webp orbit.gif orbit_0.png orbit_000.png camera.png
-    camera_0.png r_0.png splats.png splats.exr capture.json points3d.ply transforms_train.json
+    point_cloud_drgs.ply history.csv density.csv cameras.json orbit.webp orbit.gif orbit_0.png
+    orbit_000.png camera.png camera_0.png
+    r_0.png splats.png splats.exr capture.json points3d.ply transforms_train.json
     train/r_0.png renders/test/r_0.png renders/test/mine.png side_by_side/notes.txt renders/keep
     thesis.tex .hidden
 """

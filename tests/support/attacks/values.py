@@ -30,7 +30,12 @@ VALUES = (
 )
 """In YAML."""
 
-LONG_WORK = {"data.shutter_samples": ("1_000",), "iterations": ("10000.0", "2147483647", "1_000")}
+MANY_ITERATIONS = ("10000.0", "2147483647", "1_000")
+LONG_WORK = {
+    "data.shutter_samples": ("1_000",),
+    "iterations": MANY_ITERATIONS,
+    "stop_after": MANY_ITERATIONS,
+}
 """Valid values that mean endless work, by key."""
 
 ENABLING_SETTINGS = {
