@@ -392,7 +392,7 @@ def _check_cameras(film: _Film, arrays: Mapping[str, np.ndarray]) -> None:
         pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
         fits = np.abs(K - pinhole).max() <= MAX_SKEW * np.abs(K).max() < math.inf
         fits &= K[0, 0] != 0 and K[1, 1] != 0
-        expected = "((fx, 0, cx), (0, fy, cy), (0, 0, 1)), finite, without skew, fx and fy not 0"
+        expected = "((fx, 0, cx), (0, fy, cy), (0, 0, 1)) of finite numbers, not 0, without skew"
         _require(fits, f"Ks{place}", expected, K.tolist())
         is_regular = np.isfinite(viewmat).all() and np.linalg.matrix_rank(viewmat[:3, :3]) == 3
         expected = "matrices of a rotation and a translation, of finite numbers"
