@@ -520,6 +520,7 @@ REFUSED = [
     ({"opacities": np.zeros((24, 1))}, r"opacities must be of shape \(24,\)"),
     ({"Ks": np.eye(3)}, r"Ks must be of shape \(2, 3, 3\), got \(3, 3\)"),
     ({"Ks": SKEWED}, r"Ks\[1\] must be \(\(fx, 0, cx\), .*, without skew, got"),
+    ({"Ks": np.diag([0.0, 9, 1])[None].repeat(2, 0)}, r"Ks\[0\] must be .* not 0, without skew"),
     ({"viewmats": np.zeros((2, 4, 4))}, r"viewmats\[0\] must be matrices of a rot"),
     ({"backgrounds": np.zeros(3)}, r"backgrounds must be of shape \(2, 3\)"),
     ({"sh_degree": None}, r"colors must be of shape \(24, D\) or \(2, 24, D\)"),
