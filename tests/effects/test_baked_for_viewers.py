@@ -53,19 +53,26 @@ def film_of(gaussians, view):
 
 
 @pytest.mark.parametrize(
-    "fitted", [{"low_pass": 0.1, "antialiased": True}, {"low_pass": 0.05}, {"antialiased": True}]
+    ("fitted", "shown"),
+    [
+        ({"low_pass": 0.1, "antialiased": True}, 0.3),
+        ({"low_pass": 0.05}, 0.3),
+        ({"antialiased": True}, 0.3),
+        ({"low_pass": 0.1, "antialiased": True}, 0.15),
+    ],
 )
-def test_baking_matches_the_documented_closed_form(fitted):
+def test_baking_matches_the_documented_closed_form(fitted, shown):
     gaussians, fitted = small_blobs(), Approximations(**fitted)
-    found = bake_for_viewers(gaussians.to(mi.TensorXf), cameras(), fitted)
+    viewers = Approximations(low_pass=shown)
+    found = bake_for_viewers(gaussians.to(mi.TensorXf), cameras(), fitted, viewers)
 
     films = [film_of(gaussians, view) for view in VIEWS]
     nu = np.max([seen * rate for seen, rate, _ in films], axis=0)
     assert (nu > 0).all()
     variances = np.exp(2 * gaussians.log_scales.astype(float))
-    left = variances - ((0.3 - fitted.low_pass) / nu**2)[:, None]
+    left = variances - ((shown - fitted.low_pass) / nu**2)[:, None]
     left = np.maximum(left, MIN_VARIANCE_SHARE * variances)
-    if fitted.low_pass < 0.3:
+    if fitted.low_pass < 0.3 == shown:
         assert 0.05 < np.mean(left == MIN_VARIANCE_SHARE * variances) < 0.95
     np.testing.assert_allclose(found.log_scales, np.log(left) / 2, atol=2e-5)
 
@@ -76,7 +83,7 @@ def test_baking_matches_the_documented_closed_form(fitted):
     ):
         wide = np.linalg.det(old + fitted.low_pass * np.eye(2))
         before = before + seen * np.sqrt(np.linalg.det(old) if fitted.antialiased else wide)
-        after = after + seen * np.sqrt(np.linalg.det(new + 0.3 * np.eye(2)))
+        after = after + seen * np.sqrt(np.linalg.det(new + shown * np.eye(2)))
     expected = before / after / (1 + np.exp(-gaussians.logit_opacities.astype(float)))
     opacities = 1 / (1 + np.exp(-found.logit_opacities.astype(float)))
     np.testing.assert_allclose(opacities, np.minimum(expected, 1), rtol=1e-4)

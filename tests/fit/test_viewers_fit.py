@@ -120,6 +120,7 @@ def test_a_small_file_shows_what_was_fitted(tmp_path, monkeypatch, degree):
     changes = {"model.sh_degree": degree, "model.sh_increase_every": 2, "output.small_file": "sog"}
     trainer, dataset, gaussians = ended_fit(20, **changes)
     found = fit_small_file(trainer, gaussians)
+    assert (found.model.low_pass, found.model.antialiased) == (0.075, False)  # as PlayCanvas
     found.gaussians.save(tmp_path / "a.sog")
     read = Gaussians.load(tmp_path / "a.sog")
     order = morton_order(found.gaussians.means)  # in which the file has them
@@ -134,3 +135,28 @@ def test_a_small_file_shows_what_was_fitted(tmp_path, monkeypatch, degree):
     other = fit_small_file(trainer, gaussians)
     fitted, rounded = (psnr(each.images(dataset.test), dataset) for each in (found, other))
     assert fitted > rounded + 0.1
+
+
+def test_a_number_that_is_not_finite_leaves_the_small_file_unfitted(monkeypatch):
+    """Rounding would make a finite number of it."""
+    trainer, _, gaussians = ended_fit(8, **{"output.small_file": "sog"})
+    step = Trainer.step
+
+    def step_and_break(self):
+        report = step(self)
+        self.optimizer["sh0"] = self.optimizer["sh0"] * np.nan
+        return report
+
+    monkeypatch.setattr(Trainer, "step", step_and_break)
+    with pytest.warns(UserNote, match="not fitted any further: sh0: a number is not finite"):
+        found = fit_small_file(trainer, gaussians)
+    assert np.isfinite(found.gaussians.sh0).all()
+
+
+def test_several_processes_write_the_small_file_without_fitting_it(monkeypatch):
+    trainer, _, gaussians = ended_fit(8, **{"output.small_file": "sog"})
+    monkeypatch.setattr(trainer.comm, "size", 2)
+    monkeypatch.setattr(Trainer, "step", None)
+    with pytest.warns(UserNote, match="several processes write it without fitting it"):
+        found = fit_small_file(trainer, gaussians)
+    np.testing.assert_array_equal(found.gaussians.means, gaussians.means)

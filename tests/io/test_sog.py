@@ -123,6 +123,7 @@ def test_rounded_values_are_near_and_are_kept_by_the_file(tmp_path, monkeypatch)
     lengths = np.linalg.norm(values["quats"], axis=1, keepdims=True)
     # Half a step of 1/sqrt(2)/127.5 in three components, and what they leave for the largest.
     assert (np.abs(rounded["quats"] - values["quats"]) <= 0.012 * lengths).all()
+    # Steps of 1/65535 of the range of logarithms, which are as much wider at the greatest values.
     assert np.abs(rounded["means"] - values["means"]).max() < np.ptp(values["means"]) * 1e-4
     rows = np.unique(rounded["shN"].reshape(100, -1), axis=0)
     assert len(rows) <= 30
