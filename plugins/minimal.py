@@ -96,7 +96,7 @@ class MinimalSplatsIntegrator(mi.CppADIntegrator):
         splats = self.pipeline.project(rows, camera)
         grid = TileGrid(camera.width, camera.height)
         bins = bin_splats(splat_table(splats, grid, list(splats.colors)), grid, DEFAULT)
-        tiles = composite(bins, Records.from_ranks(bins, bins.rows.load))
+        tiles = composite(bins, Records.from_splats(bins, bins.rows.load))
         return sensor.film(), camera, tiles
 
 

@@ -60,7 +60,7 @@ class Copies:
             board,
             rasterize,
             derivatives=STAGES,
-            forward=["composite", "Records.from_ranks", "CompositedTiles.planes"],
+            forward=["composite", "Records.from_splats", "CompositedTiles.planes"],
             **{name: sums[name] for name in SUMS},
         )
         self.chain = Instrumented(

@@ -199,7 +199,7 @@ class PixelLists:
 
     entries: UInt32  # (items,): place in the lists -> sorted entry
     order: UInt32  # (items,): place in the lists -> item as made
-    first_item: UInt32  # (N + 1,): rank -> first of its items as made
+    items: tuple[UInt32, UInt32]  # (N,): splat -> first of its items as made, and their end
     start: UInt32  # (tiles * 16 + 1,): micro-tile -> first place
     count: int  # items
 
@@ -213,10 +213,19 @@ class PixelLists:
     def build(bins: TileBins, records: Records, depths: AffineDepths) -> PixelLists:
         """Make the lists. The host reads one value, the number of items."""
         t = types_of(bins.rows.Float)
-        # Unsorted entries, and one behind the last.
+        # Entries sorted by depth, and one behind the last.
+        splat = dr.arange(t.UInt32, bins.num_splats)
+        counts = dr.gather(t.UInt32, bins.first_entry, splat + 1)
+        counts -= dr.gather(t.UInt32, bins.first_entry, splat)
+        begin = dr.empty(t.UInt32, bins.num_splats)  # of each splat
+        dr.scatter(begin, dr.prefix_sum(dr.gather(t.UInt32, counts, bins.order)), bins.order)
+        dr.eval(begin)
         position = dr.arange(t.UInt32, bins.num_entries)
+        of_entry = dr.gather(t.UInt32, bins.splats, position)
+        place = dr.gather(t.UInt32, begin, of_entry) + dr.gather(t.UInt32, bins.source, position)
+        place -= dr.gather(t.UInt32, bins.first_entry, of_entry)
         entry = dr.zeros(t.UInt32, bins.num_entries + 1)
-        dr.scatter(entry, position, dr.gather(t.UInt32, bins.source, position))
+        dr.scatter(entry, position, place)
         dr.eval(entry)
         exists = dr.arange(t.UInt32, bins.num_entries + 1) < dr.opaque(t.UInt32, bins.num_entries)
         masks = dr.gather(t.UInt32, bins.masks, entry, exists)
@@ -230,8 +239,9 @@ class PixelLists:
         order = dr.gather(t.UInt32, by_depth, stable_order(lists, num_lists))
         entries, lists = (dr.gather(t.UInt32, c, order) for c in (entries, micro_tiles))
         dr.eval(entries, lists, order)
-        first_item = dr.gather(t.UInt32, first, bins.first_entry)
-        return PixelLists(entries, order, first_item, lower_bounds(lists, count, num_lists), count)
+        items = dr.gather(t.UInt32, first, begin), dr.gather(t.UInt32, first, begin + counts)
+        starts = lower_bounds(lists, count, num_lists)
+        return PixelLists(entries, order, items, starts, count)
 
 
 _LEVELS = 1 << 14
@@ -566,13 +576,13 @@ def _sum_items(inputs: _WalkInputs, rows: Rows, before: SplatGradients | None) -
     places = dr.empty(UInt32, size)  # (items,): item as made -> place in the lists
     dr.scatter(places, dr.arange(UInt32, size), lists.order)
 
-    def totals(rank: UInt32, sample: UInt32) -> list[Float]:
+    def totals(splat: UInt32, sample: UInt32) -> list[Float]:
         first_place = sample * dr.opaque(UInt32, lists.count)
 
         def load(item: UInt32) -> list[Float]:
             return rows.load(first_place + dr.gather(UInt32, places, item))
 
-        return sum_runs(rows.Float, lists.first_item, rank, load)
+        return sum_runs(rows.Float, *lists.items, load)
 
     return splat_gradients(inputs.bins, totals, len(inputs.samples), before)
 

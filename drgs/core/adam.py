@@ -76,7 +76,8 @@ class LeanAdam(Adam):
             super().step(eval=eval, grad_scale=grad_scale, active=active)
             return
         rates = new_rate_cache()
-        dr.eval([self._update(key, rates) for key in self.state])
+        for key in self.state:  # one kernel each: more arrays would share the sets of a cache
+            dr.eval(self._update(key, rates))
 
     def forget_moments(self) -> None:
         """Free memory of moments that are the parameters' no longer."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import Generic, TypeVar, cast
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drgs.core import types
+from drgs.core.private import access_all_lanes
 from drgs.core.types import Bool, Float, UInt32
 
 Array = TypeVar("Array", bound=dr.ArrayBase)
@@ -134,6 +135,14 @@ def repeat_array(values: Array, count: int, step: int = 0) -> Array:
     return copies + part * dr.opaque(UInt32, step) if step else copies
 
 
+def store_in_all_lanes(array_type: type[dr.ArrayBase], num_rows: int) -> AbstractContextManager:
+    """Let lanes that only fill up a vector store rows, too, behind the others: without a branch.
+
+    A single row is stored by its lane alone: Dr.Jit takes the number of its lane for a constant.
+    """
+    return access_all_lanes(array_type) if num_rows > 1 else nullcontext()
+
+
 def interleave(columns: Sequence[Array]) -> Array:
     """Return columns of equal length as one row-major flat array, not evaluated.
 
@@ -177,11 +186,17 @@ class Rows:
 
     @staticmethod
     def from_columns(columns: Sequence[types.Float]) -> Rows:
-        """Return columns of equal length, not evaluated."""
+        """Return columns of equal length, not evaluated; undefined rows may follow."""
         num_rows = dr.width(columns[0])
-        rows = Rows.empty(type(columns[0]), len(columns), num_rows)
-        rows.store(columns, dr.arange(types_of(rows.Float).UInt32, num_rows))
+        rows = Rows.empty(type(columns[0]), len(columns), num_rows + MAX_LANES)
+        with store_in_all_lanes(rows.Float, num_rows):
+            rows.store(columns, dr.arange(types_of(rows.Float).UInt32, num_rows))
         return rows
+
+    def first(self, num_rows: int) -> Rows:
+        """Return the first of these rows, which are evaluated: the same memory."""
+        widths = zip(self.blocks, block_widths(self.width), strict=True)
+        return Rows(tuple(first_numbers(block, num_rows * k) for block, k in widths), self.width)
 
     def load(self, row: UInt32, active: Bool | bool = True) -> list[types.Float]:
         """Return the numbers of a row a lane; 0 if not active."""
@@ -222,6 +237,14 @@ def load_columns(
     A row may begin anywhere in a packet: all its packets are loaded, and the numbers are shifted.
     That takes less than half the time of single loads.
     """
+    row = dr.minimum(row, num_rows - 1)  # on lanes that only fill up a vector
+    with access_all_lanes(type(flat)):
+        return _load_columns(flat, row, num_rows, stride, width)
+
+
+def _load_columns(
+    flat: Array, row: UInt32, num_rows: UInt32, stride: int, width: int
+) -> list[Array]:
     whole = (dr.width(flat) - 1) // PACKET
     if whole == 0 or width < PACKET:
         return [dr.gather(type(flat), flat, row * stride + k) for k in range(width)]
@@ -244,17 +267,27 @@ def load_columns(
 def store_columns(columns: Sequence[Array]) -> Array:
     """Return the same as :func:`interleave`, in a third of the time where there are many columns.
 
-    Packets that a row fills alone are stored whole, the numbers at its ends one by one. Up to three
-    undefined numbers may pad the last packet; :func:`first_numbers` removes them after evaluation.
+    Packets that a row fills alone are stored whole, the numbers at its ends one by one. Undefined
+    numbers follow the last row; :func:`first_numbers` removes them after evaluation.
     """
     columns, flat_type = list(columns), type(columns[0])
     width, num_rows = len(columns), dr.width(columns)
-    if width % PACKET == 0 or width < 2 * PACKET:
-        return interleave(columns)
-    size = num_rows * width
-    flat = dr.empty(flat_type, -(-size // PACKET) * PACKET)
-    _store_shifted(flat, columns)
+    size, are_whole = (num_rows + MAX_LANES) * width, width % PACKET == 0 or width < 2 * PACKET
+    padding = 0 if are_whole else -size % PACKET + _SPARE_NUMBERS
+    flat = dr.empty(flat_type, size + padding)
+    with store_in_all_lanes(flat_type, num_rows):
+        if are_whole:
+            row = dr.arange(types_of(flat_type).UInt32, num_rows)
+            dr.scatter(flat, _dynamic_vector(columns), row)
+        else:
+            _store_shifted(flat, columns)
     return flat
+
+
+MAX_LANES = 16
+"""Lanes of a vector at most: so many rows follow those that all lanes store."""
+
+_SPARE_NUMBERS = 64 * 16  # in as many cache lines as that factor
 
 
 def first_numbers(flat: Array, size: int) -> Array:
@@ -264,28 +297,36 @@ def first_numbers(flat: Array, size: int) -> Array:
 
 def _store_shifted(flat: Array, columns: list[Array]) -> None:
     t, width = types_of(type(flat)), len(columns)
-    first = dr.arange(t.UInt32, dr.width(columns)) * width
+    row = dr.arange(t.UInt32, dr.width(columns))
+    first = row * width
     begin, shift = first // PACKET, first % PACKET
     zero = t.Float(0)
-    # Else each of several scatters into one array runs the kernel once more.
-    alone = dr.ReduceMode.NoConflicts
     numbers = [*columns, *[zero] * PACKET]  # from the begin of the first packet on
     for step in (1, 2):
         moves = (shift & step) != 0
         shifted = [*[zero] * step, *numbers]
         numbers = [dr.select(moves, a, b) for a, b in zip(shifted, numbers, strict=False)]
     end = shift + width
+    # Threads, which have other rows, do not share cache lines.
+    spare = dr.opaque(t.UInt32, dr.width(flat) - _SPARE_NUMBERS) + row // 64 % 64 * 16
+
+    def store(place: UInt32, numbers: dr.ArrayBase, is_own: Bool, size: int) -> None:
+        """Store a packet, or else it goes where nobody reads: a mask would be a branch a lane."""
+        place = dr.select(is_own, place, spare) // size
+        # Else each of several scatters into one array runs the kernel once more.
+        dr.scatter(flat, numbers, place, mode=dr.ReduceMode.NoConflicts)
+
     for k in range(len(numbers) // PACKET):
         is_own = (end >= PACKET * (k + 1)) & ((shift == 0) | (k > 0))
         packet = t.Array4f(numbers[PACKET * k : PACKET * (k + 1)])
-        dr.scatter(flat, packet, begin + k, is_own, mode=alone)
+        store((begin + k) * PACKET, packet, is_own, PACKET)
     for k in range(1, PACKET):
         is_own = (shift != 0) & (shift <= k)
-        dr.scatter(flat, numbers[k], begin * PACKET + k, is_own, mode=alone)
+        store(begin * PACKET + k, numbers[k], is_own, 1)
     last = end // PACKET * PACKET  # where the packet begins that the next row fills up
     for k in range(width - PACKET + 1, width + PACKET - 1):
         is_own = (last <= k) & (k < end)
-        dr.scatter(flat, numbers[k], begin * PACKET + k, is_own, mode=alone)
+        store(begin * PACKET + k, numbers[k], is_own, 1)
 
 
 @dataclass(frozen=True)
@@ -306,13 +347,12 @@ class _Packets(Generic[Array]):
     def load_last(self, index: UInt32) -> list[Array]:
         """Return any packet a lane; numbers beyond the array are not defined."""
         last = (self.size - 1) // PACKET
-        packet = dr.gather(types_of(type(self.flat)).Array4f, self.others, index, index < last)
+        is_last = index >= last
+        packet = self.load(dr.minimum(index, last - 1))
         for k in range(PACKET):
-            number = index * PACKET + k
-            is_there = (index == last) & (number < self.size)
-            single = dr.gather(type(self.flat), self.flat, number, is_there)
-            packet[k] = dr.select(is_there, single, packet[k])
-        return list(packet)
+            number = dr.minimum(index * PACKET + k, self.size - 1)
+            packet[k] = dr.select(is_last, dr.gather(type(self.flat), self.flat, number), packet[k])
+        return packet
 
 
 def with_aligned_stack(value: Array) -> Array:

@@ -65,7 +65,7 @@ class CenterOrder:
 
     def records(self, bins: TileBins) -> Any:
         """Return the rows that compositing loads, one per sorted entry, evaluated."""
-        return Records.from_ranks(bins, bins.rows.load)
+        return Records.from_splats(bins, bins.rows.load)
 
     def composite(self, bins: TileBins, records: Any) -> CompositedTiles:
         """Composite front to back."""
@@ -118,13 +118,13 @@ class InGroups(CenterOrder):
         """Return the records of each group."""
         geometry, end = bins.model.falloff.num_geometry, bins.num_features
 
-        def numbers(group: FeatureGroup, rank: UInt32, active: Bool) -> list[Float]:
-            row = bins.rows.load(rank, active)
+        def numbers(group: FeatureGroup, splat: UInt32, active: Bool) -> list[Float]:
+            row = bins.rows.load(splat, active)
             features, keys = row[geometry:], row[geometry + end :]
             return row[:geometry] + [features[place] for place in group.stored] + keys
 
         return tuple(
-            Records.from_ranks(_select_group(group, bins), partial(numbers, group))
+            Records.from_splats(_select_group(group, bins), partial(numbers, group))
             for group in _groups(bins)
         )
 

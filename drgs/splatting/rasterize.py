@@ -138,12 +138,12 @@ class Records:
     num_features: int
 
     @staticmethod
-    def from_ranks(bins: TileBins, numbers: Callable[[UInt32, Bool], list[Float]]) -> Records:
-        """Copy each rank's ``numbers``, such as ``bins.rows.load``, and evaluate them.
+    def from_splats(bins: TileBins, numbers: Callable[[UInt32, Bool], list[Float]]) -> Records:
+        """Copy each splat's ``numbers``, such as ``bins.rows.load``, and evaluate them.
 
-        numbers: a function of ranks and active lanes. Entries that touch nothing have zeros.
+        numbers: a function of splats and active lanes. Entries that touch nothing have zeros.
         """
-        rows = Rows.from_columns(numbers(bins.ranks, bins.masks != 0))
+        rows = Rows.from_columns(numbers(bins.splats, bins.masks != 0))
         dr.eval(rows)
         return Records(rows, bins.model.falloff.num_geometry, bins.num_features)
 
@@ -186,6 +186,7 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
         active &= unfinished
         cursor = entries.advance(cursor)
         signs: Int32 | int = -1
+        following = dr.select(active, entry + 1, 0)
         # On a lane that is not active, alpha is zero and nothing changes.
         with access_all_lanes(t.Float):
             geometry, features = records.load_anywhere(entry, active)
@@ -197,7 +198,7 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
                 C = model.features.add(C, features, pixel, weight)
                 for k, value in enumerate([T, *C]):
                     values[planes * pixel + k] = value
-                ends[pixel] = dr.select(goes_on & active, entry + 1, ends[pixel])
+                ends[pixel] = dr.maximum(ends[pixel], dr.select(goes_on, following, 0))
         return cursor, values, ends, signs >= 0
 
     cursor = entries.begin()
@@ -210,7 +211,6 @@ def composite(bins: TileBins, records: Records) -> CompositedTiles:
     columns = [values[planes * pixel + k] for k in range(planes) for pixel in range(PIXELS)]
     columns[:PIXELS] = [dr.abs(T) for T in columns[:PIXELS]]
     ends = [ends[pixel] for pixel in range(PIXELS)]
-    dr.eval(columns, ends)
     rows = scatter_rows(columns, lanes.micro_tile, size)
     end_rows = scatter_rows(ends, lanes.micro_tile, size)
     last = reduce(lambda a, b: dr.select(b > a, b, a), ends)
@@ -269,15 +269,17 @@ def composite_adjoint(
     bins = tiles.bins
     pairs = CompositedPairs.find(bins, tiles.stop, samples)
     bands = split_bands(bins, pairs)
-    num_rows = int(pairs.row[dr.width(pairs.row) - 1])  # waits for the device
+    num_rows = bins.num_entries * len(samples)
+    if len(bands) > 1:  # the host has waited
+        num_rows = int(pairs.row[dr.width(pairs.row) - 1])
     sums = Rows.empty(bins.rows.Float, bins.num_sums, max(num_rows, 1))
     for band in bands:
         slots = assign_slots(pairs, band)
         partials = _partials(tiles, slots, d_planes)
         sum_entries(bins, pairs, slots, partials, sums)
 
-    def totals(rank: UInt32, sample: UInt32) -> list[Float]:
-        return sum_runs(sums.Float, pairs.first_row, pairs.run(rank, sample), sums.load)
+    def totals(splat: UInt32, sample: UInt32) -> list[Float]:
+        return sum_runs(sums.Float, *pairs.run(splat, sample), sums.load)
 
     return splat_gradients(bins, totals, len(samples), before)
 
@@ -367,18 +369,18 @@ def splat_gradients(
     num_samples: int,
     before: SplatGradients | None,
 ) -> SplatGradients:
-    """Return the derivatives of each splat, by Gaussian, from its sums, by rank.
+    """Return the derivatives of each splat from its sums.
 
-    totals: maps ranks and a sample to moments and derivatives of the features; before: derivatives
+    totals: maps splats and a sample to moments and derivatives of the features; before: derivatives
     to which the samples' are added, in their order.
     """
     t, falloff = types_of(bins.rows.Float), bins.model.falloff
-    size = dr.width(bins.order)
-    rank, count = dr.arange(t.UInt32, size), falloff.num_geometry
-    geometry = bins.rows.load(rank)[:count]
+    size, count = bins.num_splats, falloff.num_geometry
+    splat = dr.arange(t.UInt32, size)
+    geometry = bins.rows.load(splat)[:count]
 
     def terms(sample: UInt32) -> list[Float]:
-        sums = totals(rank, sample)
+        sums = totals(splat, sample)
         columns = falloff.derivatives(geometry, sums[: falloff.num_moments])
         return columns + sums[falloff.num_moments :]
 
@@ -388,9 +390,7 @@ def splat_gradients(
     if before is None:
         first, columns = 1, terms(t.UInt32(0))
     else:
-        stored = Rows.from_columns(before.geometry + before.features)  # as packets
-        dr.eval(stored)
-        first, columns = 0, stored.load(bins.order)
+        first, columns = 0, before.geometry + before.features
     if first + 1 == num_samples:  # inside of a loop, the sums would take longer
         _, columns = add(t.UInt32(first), columns)
     elif first < num_samples:
@@ -399,11 +399,9 @@ def splat_gradients(
             cond=lambda sample, columns: sample < dr.opaque(t.UInt32, num_samples),
             body=add,
         )
-    dr.eval(columns)
-    rows = Rows.empty(t.Float, len(columns), size)
-    rows.store(columns, bins.order)
+    rows = Rows.from_columns(columns)
     dr.eval(rows)
-    numbers = rows.load(rank)
+    numbers = rows.load(splat)
     return SplatGradients(geometry=numbers[:count], features=numbers[count:])
 
 
@@ -461,15 +459,10 @@ def composite_tangent(tiles: CompositedTiles, tangents: SplatGradients) -> list[
 def pack_tangents(bins: TileBins, tangents: SplatGradients) -> Records:
     """Return the tangents of the records: geometry, in the falloff's form, and features."""
     t = types_of(bins.rows.Float)
-    rank = dr.arange(t.UInt32, dr.width(bins.order))
-
-    def by_rank(columns: list[Float]) -> list[Float]:
-        return [dr.gather(t.Float, column, bins.order) for column in columns]
-
-    geometry = bins.rows.load(rank)[: bins.model.falloff.num_geometry]
-    numbers = bins.model.falloff.pack_tangents(geometry, by_rank(tangents.geometry))
-    numbers += by_rank(tangents.features)
-    numbers += [dr.zeros(t.Float, dr.width(rank))] * bins.num_keys  # not differentiated
+    splat = dr.arange(t.UInt32, bins.num_splats)
+    geometry = bins.rows.load(splat)[: bins.model.falloff.num_geometry]
+    numbers = bins.model.falloff.pack_tangents(geometry, tangents.geometry) + tangents.features
+    numbers += [dr.zeros(t.Float, bins.num_splats)] * bins.num_keys  # not differentiated
     rows = Rows.from_columns(numbers)
     dr.eval(rows)
-    return Records.from_ranks(bins, rows.load)
+    return Records.from_splats(bins, rows.load)

@@ -31,7 +31,7 @@ def add_rays_adjoint(
     if camera is None or not bins.model.falloff.follows_rays:
         return camera
     t, totals = types_of(bins.rows.Float), list(camera)
-    zero = dr.zeros(t.Float, dr.width(bins.order))
+    zero = dr.zeros(t.Float, bins.num_splats)
     still = SplatGradients([zero] * bins.model.falloff.num_geometry, [zero] * bins.num_features)
     for number in range(POSE_NUMBERS if shutter is None else 0, len(camera)):
         along = [dr.opaque(t.Float, float(number == k)) for k in range(len(camera))]

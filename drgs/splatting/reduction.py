@@ -28,19 +28,23 @@ BAND_SLOTS = 1 << 20
 """Slots of a band, as far as whole tiles allow: 38 MB, three colours in single precision.
 Smaller bands cost more in tracing and launches than they save."""
 
+PAIRS_AT_ONCE = 1 << 23
+"""Pairs of entries and micro-tiles up to which the film is one band. About a fourth are composited:
+memory for the others is never written, which costs nothing on the CPU."""
+
 
 @dataclass(frozen=True)
 class CompositedPairs:
     """Pairs of an entry and a micro-tile that were composited, in each of S samples.
 
     An entry with such a pair is *seen* and has a row of sums; those of a splat follow each other.
-    Numbers of entries, sorted and unsorted, and ranks continue from sample to sample.
+    Numbers of entries, sorted and unsorted, and splats continue from sample to sample.
     """
 
     masks: UInt32  # (S * M padded,): sorted -> bit per micro-tile
     words: UInt32  # (S * M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
     row: UInt32  # (S * M + 1,): unsorted -> row of sums, or of the next entry that is seen
-    first_row: UInt32  # (S * (N + 1),): rank -> first of its rows; one more for each sample
+    first_row: UInt32  # (S * (N + 1),): splat -> first of its rows; one more for each sample
     samples: range  # of the image
 
     @staticmethod
@@ -66,15 +70,17 @@ class CompositedPairs:
         dr.eval(words, first_row)
         return CompositedPairs(masks, words, row, first_row, samples)
 
-    def run(self, rank: UInt32, sample: UInt32) -> UInt32:
-        """Return the place of a splat's rows in ``first_row``; sample: number among the samples."""
-        num_ranks = dr.width(self.first_row) // len(self.samples)
-        return sample * dr.opaque(type(rank), num_ranks) + rank
+    def run(self, splat: UInt32, sample: UInt32) -> tuple[UInt32, UInt32]:
+        """Return the first of a splat's rows and their end; sample: number among the samples."""
+        UInt32, size = type(splat), dr.width(self.first_row) // len(self.samples)
+        place = sample * dr.opaque(UInt32, size) + splat
+        first, end = (dr.gather(UInt32, self.first_row, place + k) for k in (0, 1))
+        return first, end
 
 
 @dataclass(frozen=True)
 class Band:
-    """Consecutive tiles, their sorted entries, and the number of slots of these."""
+    """Consecutive tiles, their sorted entries, and the most slots that these may have."""
 
     tiles: range  # of all samples of the image
     entries: range  # of all samples of the pairs
@@ -88,8 +94,15 @@ class Band:
 
 
 def split_bands(bins: TileBins, pairs: CompositedPairs) -> list[Band]:
-    """Cut the film of each sample into bands; the host reads the slots and entries of each tile."""
+    """Cut the film of each sample into bands.
+
+    If all pairs of entries and micro-tiles have room, the film is one band. Otherwise, the host
+    reads the slots and entries of each tile.
+    """
     t, count = types_of(bins.rows.Float), len(pairs.samples)
+    entries, tiles = range(count * dr.width(bins.masks)), bins.grid.tiles_of(pairs.samples)
+    if MICROS * len(entries) <= PAIRS_AT_ONCE:
+        return [Band(tiles, entries, MICROS * len(entries))]
     running = dr.cumsum(dr.popcnt(pairs.masks))
     starts = repeat_array(bins.tile_start, count, dr.width(bins.masks))
     slots = dr.gather(t.UInt32, running, starts - 1, starts > 0)
@@ -194,48 +207,52 @@ def sum_entries(
     group = dr.select(micros != 0, group, slots.first_group)
     spare = dr.opaque(t.UInt32, slots.band.num_slots)
 
-    def body(micros: UInt32, totals: list) -> tuple:
-        for _ in range(2):  # two at a time wait for memory together
-            active = micros != 0
-            with access_all_lanes(t.Float):
+    def body(micros: UInt32, totals: dr.Local[Float]) -> tuple:
+        with access_all_lanes(t.Float):  # 0 is added on lanes that are not active
+            for _ in range(2):  # two at a time wait for memory together
+                active = micros != 0
                 first, word = slots.locate(group, find_lowest_bit(micros))
                 slot = dr.select(active, first + dr.popcnt(word & below), spare)
-                numbers = partials.load(slot)
-            totals = [a + dr.select(active, b, 0) for a, b in zip(totals, numbers, strict=True)]
-            micros = micros & (micros - 1)
+                for k, number in enumerate(partials.load(slot)):
+                    totals[k] = totals[k] + dr.select(active, number, 0)
+                micros = micros & (micros - 1)
         return micros, totals
 
     _, totals = dr.while_loop(
-        state=(t.UInt32(micros), [t.Float(zero) for _ in range(partials.width)]),
+        state=(t.UInt32(micros), dr.alloc_local(t.Float, partials.width, zero)),
         cond=lambda micros, totals: micros != 0,
         body=body,
     )
-    dr.eval(totals)
+    totals = [totals[k] for k in range(partials.width)]
+    rows = Rows.from_columns(totals)  # not as columns, which would share the sets of a cache
+    dr.eval(rows)
+    lane = dr.arange(t.UInt32, count)
     sample, entry = divide(entry, dr.width(bins.masks), len(pairs.samples))
     first_source = sample * dr.opaque(t.UInt32, bins.num_entries)
     source = first_source + dr.gather(t.UInt32, bins.source, entry)
-    sums.store(totals, dr.gather(t.UInt32, pairs.row, source), micros != 0)
+    sums.store(rows.load(lane), dr.gather(t.UInt32, pairs.row, source), micros != 0)
     dr.eval(sums)
 
 
 def sum_runs(
-    Float: type, first: UInt32, run: UInt32, load: Callable[[UInt32], Sequence[Float]]
+    Float: type, begin: UInt32, end: UInt32, load: Callable[[UInt32], Sequence[Float]]
 ) -> list[Float]:
-    """Sums over runs, one lane a run: run r is from ``first[r]`` to ``first[r + 1]``.
+    """Sums over runs, one lane a run, of elements from ``begin`` to ``end``.
 
-    run: r of each lane; load: the numbers of an element of a run.
+    load: the numbers of an element of a run.
     """
-    UInt32 = type(first)
-    begin, end = (dr.gather(UInt32, first, run + k) for k in (0, 1))
-    width = len(load(begin))
+    width, size = len(load(begin)), dr.width(begin)
 
-    def body(element: UInt32, totals: list) -> tuple:
-        return element + 1, [a + b for a, b in zip(totals, load(element), strict=True)]
+    def body(element: UInt32, totals: dr.Local) -> tuple:
+        active = element < end
+        with access_all_lanes(Float):
+            for k, number in enumerate(load(dr.select(active, element, 0))):
+                totals[k] = totals[k] + dr.select(active, number, 0)
+        return element + 1, totals
 
-    zero = dr.zeros(Float, dr.width(run))
     _, totals = dr.while_loop(
-        state=(begin, [Float(zero) for _ in range(width)]),
+        state=(type(begin)(begin), dr.alloc_local(Float, width, dr.zeros(Float, size))),
         cond=lambda element, totals: element < end,
         body=body,
     )
-    return totals
+    return [totals[k] for k in range(width)]

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
+from operator import or_
 
 import drjit as dr
 
@@ -194,7 +195,7 @@ def splats_adjoint(frames: list[Frame], d_planes: list[list[Float]]) -> SplatGra
     total = None
     for frame, of_frame in zip(frames, d_planes, strict=True):
         bins = frame.tiles.bins
-        at_once = max(1, ENTRIES_AT_ONCE // max(bins.num_entries, dr.width(bins.order)))
+        at_once = max(1, ENTRIES_AT_ONCE // max(bins.num_entries, bins.num_splats))
         for first in range(0, bins.grid.samples, at_once):
             samples = range(first, min(first + at_once, bins.grid.samples))
             total = frame.order.adjoint(frame.tiles, of_frame, samples, total)
@@ -225,12 +226,25 @@ def gradients_by_row(
     film. Contributions are evaluated: (N,) for each of ``camera.numbers()``; none without
     ``with_camera``.
     """
-    rows = load_rows(gaussians, given.pipeline.sh_degree)
-    d_rows, visible, d_numbers = _back_to_rows(rows, given, with_camera)
-    columns = _columns_of(d_rows, gaussians, visible)
-    faults = _nonfinite_flags(d_rows, visible)
+    cotangents, widths = given.gradients.geometry + given.gradients.features, {}
+
+    def differentiate() -> tuple[dict[str, list[Float]], list[Float], Bool, UInt32]:
+        rows = load_rows(gaussians, given.pipeline.sh_degree)
+        d_rows, visible, d_numbers = _back_to_rows(rows, given, with_camera)
+        by_row = [dr.select(visible, number, 0) for number in d_numbers]
+        columns = _columns_of(d_rows, gaussians, visible)
+        widths.update({name: len(each) for name, each in columns.items()}, camera=len(by_row))
+        return columns, by_row, visible, _nonfinite_flags(d_rows, visible)
+
+    def skip() -> tuple[dict[str, list[Float]], list[Float], Bool, UInt32]:
+        t = types_of(type(cotangents[0]))
+        zeros = {name: [t.Float(0) for _ in range(width)] for name, width in widths.items()}
+        return zeros, zeros.pop("camera"), t.Bool(False), t.UInt32(NO_FAULT)
+
+    # Vectors of Gaussians that no pixel depends on are skipped.
+    is_seen = reduce(or_, (cotangent != 0 for cotangent in cotangents))
+    columns, by_row, visible, faults = dr.if_stmt((), is_seen, differentiate, skip)
     parameters = _as_tensors(columns, gaussians, [faults])
-    by_row = [dr.select(visible, number, 0) for number in d_numbers]
     dr.eval(by_row)
     return GaussianGradients(parameters, given.gradients.means2d, visible, dr.min(faults)), by_row
 
@@ -438,9 +452,6 @@ def _nonfinite_flags(d_rows: GaussianRows, visible: Bool) -> UInt32:
 
 def on_film(bins: TileBins) -> Bool:
     """Return the Gaussians that have entries."""
-    t = types_of(bins.rows.Float)
-    rank = dr.arange(t.UInt32, dr.width(bins.order))
-    first, end = (dr.gather(t.UInt32, bins.first_entry, rank + k) for k in (0, 1))
-    visible = dr.empty(t.Bool, dr.width(bins.order))
-    dr.scatter(visible, first < end, bins.order)
-    return visible
+    splat = dr.arange(type(bins.first_entry), bins.num_splats)
+    first, end = (dr.gather(type(splat), bins.first_entry, splat + k) for k in (0, 1))
+    return first < end

@@ -28,7 +28,6 @@ from typing_extensions import override
 
 from drgs.cameras.lens import shortest
 from drgs.core.arrays import Rows, interleave, reinterpret, types_of
-from drgs.core.errors import UserError
 from drgs.core.private import access_all_lanes, bucket_order
 from drgs.core.types import Bool, Float, UInt32
 from drgs.splatting.footprint import DEFAULT, ImageModel
@@ -42,18 +41,17 @@ WORD = 32  # entries in a word of the transposed masks
 class TileBins:
     """Entries sorted by tile, then by depth.
 
-    N splats in depth order are *ranks*; M entries in the order of the ranks are *unsorted*, in the
-    order of the tiles *sorted*. Sorted arrays are padded to a multiple of 32 with entries that
-    touch no micro-tile.
+    M entries of N splats are *unsorted* in the order of the Gaussians, *sorted* in that of the
+    tiles. Sorted arrays are padded to a multiple of 32 with entries that touch no micro-tile.
     """
 
-    order: UInt32  # (N,): rank -> index of the Gaussian
-    rows: Rows  # by rank: geometry, features, keys
+    rows: Rows  # by Gaussian: geometry, features, keys
     num_features: int
     num_keys: int
-    first_entry: UInt32  # (N + 1,): rank -> first of its run of unsorted entries
+    first_entry: UInt32  # (N + 1,): Gaussian -> first of its run of unsorted entries
+    order: UInt32  # (N,): Gaussians by depth
     source: UInt32  # (M padded,): sorted -> unsorted
-    ranks: UInt32  # (M padded,): sorted -> rank
+    splats: UInt32  # (M padded,): sorted -> Gaussian
     tiles: UInt32  # (M padded,): sorted -> tile
     masks: UInt32  # (M padded,): sorted -> bit per micro-tile that the splat touches
     words: UInt32  # (M padded / 32 * 16,): (group of 32, micro-tile) -> bit per entry
@@ -61,6 +59,11 @@ class TileBins:
     num_entries: int  # M
     grid: TileGrid
     model: ImageModel
+
+    @property
+    def num_splats(self) -> int:
+        """N, number of Gaussians."""
+        return dr.width(self.first_entry) - 1
 
     @property
     def num_sums(self) -> int:
@@ -100,54 +103,52 @@ def splat_table(
     rows = Rows.from_columns([*geometry, *features, *keys])
     depths = dr.select(splats.visible, splats.depths, dr.inf)
     dr.eval(boxes, rows, depths)
+    boxes, rows = (each.first(dr.width(depths)) for each in (boxes, rows))
     return SplatTable(boxes, rows, depths, len(features), len(keys))
 
 
 def bin_splats(table: SplatTable, grid: TileGrid, model: ImageModel) -> TileBins:
     """Distribute splats over the tiles of ``grid``, front to back.
 
-    Not differentiated. The host reads one value, the number of entries. Raises UserError if there
-    are more than 2^26 Gaussians.
+    Not differentiated. The host reads one value, the number of entries.
     """
     boxes, rows, depths = table.boxes, table.rows, table.depths
     num_features, num_keys = table.num_features, table.num_keys
     del table  # releases its arrays before the function ends
     t = types_of(type(depths))
-    if dr.width(depths) > 1 << _RANK_BITS:
-        raise UserError(
-            f"at most {1 << _RANK_BITS:,} Gaussians can be distinguished in a tile, got "
-            f"{dr.width(depths):,}; render them in parts, or prune them"
-        )
+    num_splats = dr.width(depths)
+    splat = dr.arange(t.UInt32, num_splats + 1)
+    counts = t.UInt32(boxes.load(splat, splat < dr.opaque(t.UInt32, num_splats))[-1])
+    first_entry = dr.prefix_sum(counts)
+    num_entries = int(first_entry[num_splats])  # before sorting, which waits for the device, too
     # A stable sort: equal depths stay in the order of the Gaussians.
     order = t.UInt32(dr.argsort(depths))
     # In a separate kernel: loads without arithmetic overlap their latencies.
-    box = boxes.load(order)
-    boxes, rows = Rows.from_columns(box), Rows.from_columns(rows.load(order))
-    counts = t.UInt32(box[-1])
-    dr.eval(boxes, rows, counts)
-    num_splats = dr.width(order)
-    rank = dr.arange(t.UInt32, num_splats + 1)
-    counts = dr.gather(t.UInt32, counts, rank, rank < dr.opaque(t.UInt32, num_splats))
-    first_entry = dr.prefix_sum(counts)
-    num_entries = int(first_entry[num_splats])
-
-    tile, entries = _make_entries(first_entry, boxes, rows, num_entries, grid, model)
-    source = stable_order(tile, grid.num_tiles)
-    ranks, tiles, masks = _unpack(*dr.gather(t.Array2u, entries, source))
-    dr.eval(ranks, tiles, masks)
-    # Both would wait in memory for the end of the function.
-    del tile, entries
+    by_depth = _ByDepth(
+        order,
+        dr.gather(t.UInt32, first_entry, order),
+        dr.gather(t.UInt32, counts, order),
+        Rows.from_columns(boxes.load(order)),
+        Rows.from_columns(rows.load(order)[: model.falloff.num_geometry]),
+    )
+    dr.eval(by_depth)
+    tiles, entries = _make_entries(by_depth, num_entries, grid, model)
+    by_tile = stable_order(tiles, grid.num_tiles)
+    source, splats, tiles, masks = dr.gather(t.Array4u, entries, by_tile)
+    dr.eval(source, splats, tiles, masks)
+    # They would wait in memory for the end of the function.
+    del by_depth, entries, by_tile
     words = transpose_masks(masks)
     tile_start = lower_bounds(tiles, num_entries, grid.num_tiles)
     dr.eval(words, tile_start)
     return TileBins(
-        order=order,
         rows=rows,
         num_features=num_features,
         num_keys=num_keys,
         first_entry=first_entry,
+        order=order,
         source=source,
-        ranks=ranks,
+        splats=splats,
         tiles=tiles,
         masks=masks,
         words=words,
@@ -218,26 +219,40 @@ def _wrap_columns(
     return first, last, dr.select(crosses & ~everywhere, type(first)(grid.columns), 0)
 
 
+@dataclass(frozen=True)
+class _ByDepth:
+    """Splats sorted by depth."""
+
+    splats: UInt32  # numbers
+    first_entries: UInt32  # unsorted
+    counts: UInt32  # of entries
+    boxes: Rows
+    geometry: Rows
+
+
 def _make_entries(
-    first_entry: UInt32, boxes: Rows, rows: Rows, count: int, grid: TileGrid, model: ImageModel
+    splats: _ByDepth, count: int, grid: TileGrid, model: ImageModel
 ) -> tuple[UInt32, UInt32]:
-    """Return the tile of each entry, and two words: see :func:`_pack`.
+    """Return entries sorted by depth: their tiles, and rows (unsorted entry, splat, tile, mask).
 
     count: of entries. Padding entries are in the last tile and touch nothing: a stable sort leaves
     them at the end.
     """
-    t = types_of(rows.Float)
+    t = types_of(splats.geometry.Float)
     # Rank of each entry: write each rank at the start of its run, then a running maximum.
     padded = -(-max(count, 1) // WORD) * WORD
-    rank = dr.arange(t.UInt32, dr.width(first_entry) - 1)
-    start, end = dr.gather(t.UInt32, first_entry, rank), dr.gather(t.UInt32, first_entry, rank + 1)
-    starts = dr.zeros(t.UInt32, padded)
-    dr.scatter(starts, rank, start, start < end)
-    rank = dr.prefix_reduce(dr.ReduceOp.Max, starts, exclusive=False)
+    first, runs = dr.prefix_sum(splats.counts), dr.zeros(t.UInt32, padded)
+    dr.scatter(runs, dr.arange(t.UInt32, dr.width(first)), first, splats.counts > 0)
+    rank = dr.prefix_reduce(dr.ReduceOp.Max, runs, exclusive=False)
 
-    tile_x, tile_y, columns = (t.UInt32(number) for number in boxes.load(rank)[:3])
-    entry = dr.arange(t.UInt32, padded)
-    local = entry - dr.gather(t.UInt32, first_entry, rank)
+    place = dr.arange(t.UInt32, padded)
+    exists = place < dr.opaque(t.UInt32, count)
+    with access_all_lanes(t.Float):  # there are whole vectors
+        local = place - dr.gather(t.UInt32, first, rank)
+        splat = dr.gather(t.UInt32, splats.splats, rank)
+        entry = dr.gather(t.UInt32, splats.first_entries, rank) + local
+        tile_x, tile_y, columns = (t.UInt32(number) for number in splats.boxes.load(rank)[:3])
+        geometry = splats.geometry.load(rank)
     # Exact while a splat covers fewer than 2^22 tiles; an integer division by a varying number
     # has no vector instruction.
     row = t.UInt32((t.Float(local) + 0.5) / t.Float(columns))
@@ -247,31 +262,13 @@ def _make_entries(
         tile_x = dr.select(tile_x >= columns, tile_x - columns, tile_x)
     tile_y = tile_y + row
     tile = dr.fma(tile_y, dr.opaque(t.UInt32, grid.columns), tile_x)
-    geometry = rows.load(rank)[: model.falloff.num_geometry]
     mask = _touched_micros(geometry, tile_x, tile_y, grid, model)
-    exists = entry < dr.opaque(t.UInt32, count)
     tile = dr.select(exists, tile, dr.opaque(t.UInt32, grid.num_tiles - 1))
-    entries = interleave(_pack(rank, tile, dr.select(exists, mask, 0)))
+    entry, mask = dr.select(exists, entry, place), dr.select(exists, mask, 0)
+    with access_all_lanes(t.Float):
+        entries = interleave([entry, splat, tile, mask])
     dr.eval(tile, entries)
     return tile, entries
-
-
-_RANK_BITS = 26  # with 64 - 16 - 26 bits for the tile
-
-
-def _pack(rank: UInt32, tile: UInt32, mask: UInt32) -> list[UInt32]:
-    """Pack an entry into two words: 26 bits of rank, 22 of tile, 16 of mask.
-
-    2^22 tiles have 2^30 pixels; four planes of them exceed an array of Dr.Jit. More ranks are
-    refused by :func:`bin_splats`.
-    """
-    return [rank | ((tile >> MICROS) << _RANK_BITS), mask | (tile << MICROS)]
-
-
-def _unpack(first: UInt32, second: UInt32) -> tuple[UInt32, UInt32, UInt32]:
-    """Return rank, tile and mask of an entry."""
-    tile = (second >> MICROS) | ((first >> _RANK_BITS) << MICROS)
-    return first & ((1 << _RANK_BITS) - 1), tile, second & ((1 << MICROS) - 1)
 
 
 def stable_order(keys: UInt32, bound: int) -> UInt32:

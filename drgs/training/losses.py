@@ -27,7 +27,8 @@ from typing_extensions import override
 
 from drgs.config.extensions import LOSS_TERMS, LOSSES, section_of
 from drgs.config.schema import FitConfig
-from drgs.core.arrays import is_float64, types_of
+from drgs.core.arrays import MAX_LANES, is_float64, types_of
+from drgs.core.private import access_all_lanes
 from drgs.core.types import ArrayXf, Bool, Float, TensorXf, UInt32
 
 C1, C2 = 0.01**2, 0.03**2
@@ -341,6 +342,10 @@ class _Tiling:
         """Rows (or columns) of all tiles of all channels."""
         return _CHANNELS * math.prod(self.grid) * _TILE
 
+    def empty(self, float_type: type[Float]) -> Float:
+        """Allocate an image in tiles, and lines behind it for lanes that only fill up a vector."""
+        return dr.empty(float_type, (self.num_lines + MAX_LANES) * _TILE)
+
     def to_tiles(self, flat: Float) -> Float:
         """Bring a row-major (H, W, 3) image into tiles, row order; one lane a row, all channels."""
         lines = self.num_lines // _CHANNELS
@@ -348,13 +353,15 @@ class _Tiling:
         _, tile_row, tile_column = self.split(lane // _TILE)
         row, column = tile_row * _TILE + lane % _TILE, tile_column * _TILE
         first = (row * self.width + column) * _CHANNELS
-        tiles = dr.empty(type(flat), self.num_lines * _TILE)
+        tiles = self.empty(type(flat))
         for channel in range(_CHANNELS):
             values = []
             for k in range(_TILE):
                 inside = (row < self.height) & (column + k < self.width)
-                source = first + (_CHANNELS * k + channel)
-                values.append(dr.gather(type(flat), flat, source, inside))
+                source = dr.select(inside, first + (_CHANNELS * k + channel), 0)
+                with access_all_lanes(type(flat)):
+                    value = dr.gather(type(flat), flat, source)
+                values.append(dr.select(inside, value, 0))
             _store_packets(tiles, values, lane + channel * lines)
         return tiles
 
@@ -419,17 +426,19 @@ class _Lines:
 
     def store(self, values: list[Float]) -> Float:
         """Store each line's 8 values, contiguous along lines."""
-        flat = dr.empty(type(values[0]), self.tiling.num_lines * _TILE)
-        _store_packets(flat, values, self.lane)
+        flat = self.tiling.empty(type(values[0]))
+        with access_all_lanes(type(flat)):
+            _store_packets(flat, values, self.lane)
         return flat
 
     def store_across(self, values: list[Float]) -> Float:
         """Store them contiguous across lines: rows in column order, columns in row order."""
-        flat = dr.empty(type(values[0]), self.tiling.num_lines * _TILE)
+        flat = self.tiling.empty(type(values[0]))
         line = self.lane % _TILE
         first = (self.lane - line) * _TILE + line
-        for k, value in enumerate(values):
-            dr.scatter(flat, value, first + k * _TILE, mode=dr.ReduceMode.NoConflicts)
+        with access_all_lanes(type(flat)):
+            for k, value in enumerate(values):
+                dr.scatter(flat, value, first + k * _TILE, mode=dr.ReduceMode.NoConflicts)
         return flat
 
     def _read_packet(self, values: Float, line: UInt32, valid: Bool | bool) -> ArrayXf:

@@ -24,6 +24,7 @@ from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.effects.base import integrator_settings, training_effects
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
+from drgs.gaussians.space_order import space_order
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.state import SplatsPlugin
@@ -112,7 +113,7 @@ class Trainer:
         views_per_step = config.optimizer.views_per_step
         self.config, self.dataset, self.extent = config, dataset, dataset.extent
         self.comm = comm = comm or Communicator()
-        total = gaussians.num_gaussians
+        gaussians, total = gaussians[space_order(gaussians.means)], gaussians.num_gaussians
         check_shardable(config, comm.size, total)
         self.effects = training_effects(config, dataset, parts.effects)
         self._parts, self._room = parts, room
@@ -322,6 +323,7 @@ class Trainer:
             change = density.refine(self.population, iteration)
             if checked_report(density, change, self.num_gaussians) is not None:
                 report = change
+                self._sort_rows()
                 for effect in self.effects:
                     effect.on_population_change(self.fit_state(step, iteration))
                 # Freed arrays of sizes that will not come again would stay with Dr.Jit's allocator.
@@ -484,6 +486,15 @@ class Trainer:
         self._restore_effects({e.name: _part(state, f"{e.name}/") for e in self.effects})
         self.watch = GradientWatch()
         self.params.update(self.optimizer)
+
+    def _sort_rows(self) -> None:
+        """Sort the rows, with the strategy's statistics: see :func:`.space_order`."""
+        population, state = self.population, self.density.state()
+        order = space_order(population.host("means"))
+        population.edit(population.to_device_indices(order))
+        for name in self.density.by_row:
+            state[name] = population.local(population.gather(state[name])[order])
+        self.density.restore(state)
 
     def _restore_effects(self, states: Mapping[str, Mapping[str, np.ndarray]]) -> None:
         fit = self.fit_state()

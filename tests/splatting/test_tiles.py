@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from support.hard_cases import FAMILIES
 from support.helpers import (
-    FLOAT32,
     Case,
     bin_splats,
     both_precisions,
@@ -17,7 +16,6 @@ from support.helpers import (
     stacked_scene,
 )
 
-from drgs.core.errors import UserError
 from drgs.reference import splatting as reference
 from drgs.splatting import tiles
 from drgs.splatting.grid import GRID, MICRO, MICROS, TILE, TileGrid
@@ -42,7 +40,7 @@ class Binned:
     """``TileBins`` on the host, padding included, and what it was made of."""
 
     case: Case
-    splats: object
+    projected: object
     bins: object
 
     def __getattr__(self, name):
@@ -54,13 +52,12 @@ class Binned:
 
     @property
     def visible(self) -> np.ndarray:
-        return np.array(self.splats.visible)
+        return np.array(self.projected.visible)
 
     def mask_table(self) -> np.ndarray:
         """(N, tiles): the mask of each (Gaussian, tile), 0 where there is no entry."""
         table = np.zeros((len(self.order), self.bins.grid.num_tiles), dtype=np.int64)
-        gaussians = self.order[self.ranks[: self.count]]
-        table[gaussians, self.tiles[: self.count]] = self.masks[: self.count]
+        table[self.splats[: self.count], self.tiles[: self.count]] = self.masks[: self.count]
         return table
 
 
@@ -90,15 +87,15 @@ def test_masks_equal_a_brute_force_ellipse_test(precision, case):
     binned = bin_case(case, precision)
     grid = binned.bins.grid
     table = binned.mask_table()
-    rank = dr.arange(dr.llvm.ad.UInt32, len(binned.order))
-    geometry = np.stack([np.array(v, float) for v in binned.bins.rows.load(rank)], axis=1)
+    splat = dr.arange(dr.llvm.ad.UInt32, len(binned.visible))
+    geometry = np.stack([np.array(v, float) for v in binned.bins.rows.load(splat)], axis=1)
     undecided = total = 0
     tile = np.arange(grid.num_tiles)[:, None]
     micro = np.arange(MICROS)[None, :]
     left = tile % grid.columns * TILE + micro % GRID * MICRO + 0.5
     top = tile // grid.columns * TILE + micro // GRID * MICRO + 0.5
-    for rank in range(binned.visible.sum()):
-        mean_x, mean_y, p, r, s, log2_opacity = geometry[rank]
+    for splat in np.flatnonzero(binned.visible):
+        mean_x, mean_y, p, r, s, log2_opacity = geometry[splat]
         x0, y0 = left - mean_x, top - mean_y
         x1, y1 = x0 + MICRO - 1, y0 + MICRO - 1
         candidates = []
@@ -112,15 +109,15 @@ def test_masks_equal_a_brute_force_ellipse_test(precision, case):
         smallest = np.where(inside, 0, np.min(candidates, axis=0))
         reach = log2_opacity - np.log2(reference.ALPHA_CUT)
 
-        actual = (table[binned.order[rank]][:, None] >> micro & 1).astype(bool)
+        actual = (table[splat][:, None] >> micro & 1).astype(bool)
         slack = grid.cull_margin
         must_not = smallest > reach + slack * 1.1
-        assert not (actual & must_not).any(), f"rank {rank}: bits outside the ellipse"
+        assert not (actual & must_not).any(), f"splat {splat}: bits outside the ellipse"
         # A micro-tile that reaches over the border may be touched off the film only: then the
         # box, which ends at the film's last pixel, need not list its tile. Whole ones must be.
         whole = (left + MICRO <= case.width + 0.5) & (top + MICRO <= case.height + 0.5)
         must = (smallest <= reach) & whole
-        assert actual[must].all(), f"rank {rank}: missing bits"
+        assert actual[must].all(), f"splat {splat}: missing bits"
         undecided += ((smallest > reach) & ~must_not).sum()
         total += must.sum()
     assert undecided <= 2 + 1e-2 * total, "the margin decides too much"
@@ -131,8 +128,8 @@ def test_masks_equal_a_brute_force_ellipse_test(precision, case):
 def test_entries_are_sorted_by_tile_then_depth(precision, case):
     binned = bin_case(case, precision)
     count, visible = binned.count, binned.visible
-    # Ranks: the visible ones by depth, ties by index; then the others.
-    depths = rows(binned.splats.depths)
+    # The visible ones by depth, ties by index; then the others.
+    depths = rows(binned.projected.depths)
     expected = np.argsort(np.where(visible, depths, np.inf), kind="stable")
     np.testing.assert_array_equal(binned.order, expected)
     reference_order = reference.depth_order(
@@ -140,7 +137,8 @@ def test_entries_are_sorted_by_tile_then_depth(precision, case):
     )
     np.testing.assert_array_equal(binned.order[: visible.sum()], reference_order)
 
-    key = binned.tiles[:count] * len(depths) + binned.ranks[:count]
+    rank = np.argsort(binned.order)
+    key = binned.tiles[:count] * len(depths) + rank[binned.splats[:count]]
     assert (np.diff(key) > 0).all(), "sorted by (tile, rank), each pair once"
     assert binned.bins.grid.num_tiles > binned.tiles[:count].max(initial=0)
 
@@ -154,12 +152,12 @@ def test_tile_start_and_sources_and_padding(precision, case):
         binned.tile_start, np.searchsorted(binned.tiles[:count], np.arange(num_tiles + 1))
     )
     padded = -(-max(count, 1) // WORD) * WORD
-    assert {len(getattr(binned, n)) for n in ("source", "ranks", "tiles", "masks")} == {padded}
+    assert {len(getattr(binned, n)) for n in ("source", "splats", "tiles", "masks")} == {padded}
     assert not binned.masks[count:].any()
     np.testing.assert_array_equal(np.sort(binned.source[:count]), np.arange(count))
-    # An entry's source lies in the run of its rank.
+    # An entry's source lies in the run of its splat.
     run = np.searchsorted(binned.first_entry, binned.source[:count], side="right") - 1
-    np.testing.assert_array_equal(run, binned.ranks[:count])
+    np.testing.assert_array_equal(run, binned.splats[:count])
 
 
 def round_splats(precision, means2d, sigma=1.0, depths=None, opacities=0.5, visible=True):
@@ -218,10 +216,3 @@ def test_round_splats_have_entries_in_the_tiles_they_touch(precision, name):
     np.testing.assert_array_equal(np.array(bins.tiles)[:count], expected_tiles)
     np.testing.assert_array_equal(np.array(bins.masks)[:count], expected_masks)
     assert not np.array(bins.masks)[count:].any() and np.array(bins.tile_start)[-1] == count
-
-
-def test_more_splats_than_ranks_are_refused(monkeypatch):
-    monkeypatch.setattr(tiles, "_RANK_BITS", 2)  # 2^26 splats would need gigabytes
-    splats = round_splats(FLOAT32, np.full((5, 2), 8.0))
-    with pytest.raises(UserError, match="at most 4 Gaussians"):
-        bin_splats(splats, TileGrid(16, 16))

@@ -121,7 +121,8 @@ def test_depth_penalty_matches_rendered_depth_and_alpha(dataset):
 
 def test_gradient_of_the_depth_penalty_equals_differences_of_the_reference():
     """Along a direction of each parameter."""
-    start, step, trainer = fits.double(fits.disturbed_blobs()), 1e-6, depth_trainer()
+    trainer, step = depth_trainer(), 1e-6
+    start = fits.double(trainer.gaussians())
     pairs = zip(fits.true_dataset().train, trainer.views, strict=True)
     photo, view = next(p for p in pairs if not fits.photograph(start, p[0]).near_threshold.any())
     (effect,) = trainer.effects

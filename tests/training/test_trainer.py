@@ -10,6 +10,7 @@ from support.kernels import kernel_hashes
 from support.small_fits import steps
 from support.trainers import make_trainer
 
+from drgs.core.arrays import MAX_LANES
 from drgs.training.losses import TARGET_BYTES
 from drgs.training.steps import bytes_per_pixel
 
@@ -115,7 +116,8 @@ def test_device_memory_of_a_view_is_counted():
     arrays += [view.uploads["colors"].array, view.uploads["background"].array]
     arrays += view.uploads["depth"]
     count = sum(len(array) for array in arrays) * 4
-    assert count == view.width * view.height * bytes_per_pixel(trainer.effects)
+    padding = count - view.width * view.height * bytes_per_pixel(trainer.effects)
+    assert 0 <= padding <= 3 * MAX_LANES * 8 * 4, "lines that only fill up a vector"
 
 
 def test_finished_stage_leaves_no_arrays_on_the_device():

@@ -81,6 +81,7 @@ class LocalSplats:
         boxes, stored = (Rows.from_columns(each.load(rows)) for each in (splats.boxes, splats.rows))
         depths = dr.gather(float_type, splats.depths, rows)
         dr.eval(boxes, stored, depths)
+        boxes, stored = boxes.first(count), stored.first(count)
         return [each.numpy().reshape(count, -1) for each in [*boxes.blocks, *stored.blocks, depths]]
 
     def unpack(self, rows: UInt32, blocks: Blocks, width: int) -> list[Float]:
