@@ -226,27 +226,31 @@ def gradients_by_row(
     film. Contributions are evaluated: (N,) for each of ``camera.numbers()``; none without
     ``with_camera``.
     """
+    if with_camera:  # an error here, and not in a branch, is not wrapped by Dr.Jit's own
+        given.pipeline.model.features.check_differentiable_in_camera()
     cotangents, widths = given.gradients.geometry + given.gradients.features, {}
+    t = types_of(type(cotangents[0]))
+    # Not literals: Dr.Jit 1.5 takes one that a branch returns for the same one behind it.
+    zero, no_fault = dr.opaque(t.Float, 0), dr.opaque(t.UInt32, NO_FAULT)
 
-    def differentiate() -> tuple[dict[str, list[Float]], list[Float], Bool, UInt32]:
+    def differentiate() -> tuple[dict[str, list[Float]], list[Float], UInt32]:
         rows = load_rows(gaussians, given.pipeline.sh_degree)
         d_rows, visible, d_numbers = _back_to_rows(rows, given, with_camera)
-        by_row = [dr.select(visible, number, 0) for number in d_numbers]
-        columns = _columns_of(d_rows, gaussians, visible)
+        by_row = [dr.select(visible, number, zero) for number in d_numbers]
+        columns = _columns_of(d_rows, gaussians, visible, zero)
         widths.update({name: len(each) for name, each in columns.items()}, camera=len(by_row))
-        return columns, by_row, visible, _nonfinite_flags(d_rows, visible)
+        return columns, by_row, _nonfinite_flags(d_rows, visible)
 
-    def skip() -> tuple[dict[str, list[Float]], list[Float], Bool, UInt32]:
-        t = types_of(type(cotangents[0]))
-        zeros = {name: [t.Float(0) for _ in range(width)] for name, width in widths.items()}
-        return zeros, zeros.pop("camera"), t.Bool(False), t.UInt32(NO_FAULT)
+    def skip() -> tuple[dict[str, list[Float]], list[Float], UInt32]:
+        zeros = {name: [t.Float(zero) for _ in range(width)] for name, width in widths.items()}
+        return zeros, zeros.pop("camera"), t.UInt32(no_fault)
 
-    # Vectors of Gaussians that no pixel depends on are skipped.
-    is_seen = reduce(or_, (cotangent != 0 for cotangent in cotangents))
-    columns, by_row, visible, faults = dr.if_stmt((), is_seen, differentiate, skip)
+    # Vectors of Gaussians that no pixel depends on are skipped; those of NaN are not.
+    is_seen = reduce(or_, (~(cotangent == 0) for cotangent in cotangents))
+    columns, by_row, faults = dr.if_stmt((), is_seen, differentiate, skip)
     parameters = _as_tensors(columns, gaussians, [faults])
     dr.eval(by_row)
-    return GaussianGradients(parameters, given.gradients.means2d, visible, dr.min(faults)), by_row
+    return GaussianGradients(parameters, given.gradients.means2d, is_seen, dr.min(faults)), by_row
 
 
 def sum_of_views(
@@ -266,7 +270,8 @@ def sum_of_views(
         for each in view:
             copy = dr.copy(rows)  # separates the derivatives of the cameras
             d_rows, visible, _ = _back_to_rows(copy, each)
-            for name, columns in _columns_of(d_rows, gaussians, visible).items():
+            zero = type(gaussians.logit_opacities)(0)
+            for name, columns in _columns_of(d_rows, gaussians, visible, zero).items():
                 terms = zip(total[name], columns, strict=True) if name in total else ()
                 total[name] = [a + b for a, b in terms] or columns
             flags.append(_nonfinite_flags(d_rows, visible))
@@ -386,7 +391,9 @@ def frames_tangent(
     return tangents_with_rays(frames, direction, camera_tangents)
 
 
-def _columns_of(d_rows: GaussianRows, like: Gaussians, visible: Bool) -> dict[str, list[Float]]:
+def _columns_of(
+    d_rows: GaussianRows, like: Gaussians, visible: Bool, zero: Float
+) -> dict[str, list[Float]]:
     """Return per-lane derivatives by parameter, column by column.
 
     The gradient of invisible rows is zero, also if their values are not finite; so is that of SH
@@ -399,7 +406,7 @@ def _columns_of(d_rows: GaussianRows, like: Gaussians, visible: Bool) -> dict[st
     columns["smoothing"] = [] if d_rows.smoothing is None else [d_rows.smoothing]
     columns |= d_rows.features or {}
     return {
-        name: [dr.select(visible, component, t.Float(0)) for component in components]
+        name: [dr.select(visible, component, zero) for component in components]
         for name, components in columns.items()
         if len(components)
     }

@@ -23,8 +23,8 @@ from drgs.core.memory import release_unused_memory
 from drgs.core.types import Float, TensorXf
 from drgs.datasets.types import Dataset, View
 from drgs.effects.base import integrator_settings, training_effects
+from drgs.gaussians.morton import space_order
 from drgs.gaussians.parameters import PARAMETER_NAMES, Gaussians
-from drgs.gaussians.space_order import space_order
 from drgs.initialization.defaults import resolve_defaults
 from drgs.integrator.scene import make_scene, render_views
 from drgs.integrator.state import SplatsPlugin
