@@ -16,7 +16,8 @@ from drgs.core.errors import UserError
 from drgs.core.memory import available_memory, format_bytes, resident_memory
 from drgs.datasets.images import is_on_disk
 from drgs.datasets.types import Dataset, View
-from drgs.splatting.reduction import BAND_SLOTS
+from drgs.splatting.grid import MICROS
+from drgs.splatting.reduction import BAND_SLOTS, PAIRS_AT_ONCE
 from drgs.training.density.phases import density_strategy
 from drgs.training.parallel.communicator import Communicator
 
@@ -83,7 +84,10 @@ def estimate(
         number * (1 + reach * math.sqrt(pixels / number)) ** 2
         for number, reach in ((start, START_REACH), (count, FITTED_REACH))
     )
-    splats = ENTRY_BYTES * entries * times + SLOT_BYTES * min(SLOTS * entries, BAND_SLOTS)
+    slots = SLOTS * entries
+    if MICROS * entries > PAIRS_AT_ONCE:
+        slots = min(slots, BAND_SLOTS)
+    splats = ENTRY_BYTES * entries * times + SLOT_BYTES * slots
     ahead = AHEAD_BYTES * pixels if any(map(is_on_disk, train)) else 0
     numbers = 11 + 3 * (config.model.sh_degree + 1) ** 2
     of_gaussian = NUMBER_BYTES * numbers + GAUSSIAN_BYTES + (GROWTH_BYTES if count > start else 0)

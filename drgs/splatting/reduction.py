@@ -5,8 +5,8 @@ composited (entry, micro-tile) pair has a *slot*, which only this lane writes. (
 write behind the slots, which nobody reads.) Then one lane per entry adds the entry's slots, and one
 lane per splat its entries. The result is the same to the last bit in every run.
 
-To save memory, the image is divided into *bands* of tiles, and only the slots of one band exist at
-a time.
+To save memory, an image of many entries is divided into *bands* of tiles, and only the slots of one
+band exist at a time.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ BAND_SLOTS = 1 << 20
 Smaller bands cost more in tracing and launches than they save."""
 
 PAIRS_AT_ONCE = 1 << 23
-"""Pairs of entries and micro-tiles up to which the film is one band. About a fourth are composited:
-memory for the others is never written, which costs nothing on the CPU."""
+"""Pairs of entries and micro-tiles up to which the film is one band, so that the host need not wait
+for their slots to be counted. About a fourth have one; other memory is never written to, which
+costs nothing on the CPU."""
 
 
 @dataclass(frozen=True)
