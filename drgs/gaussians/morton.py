@@ -20,9 +20,9 @@ def space_order(means: np.ndarray) -> np.ndarray:
     finite = means[np.isfinite(means).all(axis=1)]
     if len(finite) == 0:
         return np.arange(len(means))
-    low, high = finite.min(axis=0), finite.max(axis=0)
-    means = np.clip(np.nan_to_num(means), low, high)
-    cells = (means - low) / np.maximum(high - low, np.finfo(float).tiny) * (2**BITS - 1)
+    low, high = finite.min(axis=0).astype(float), finite.max(axis=0).astype(float)
+    size = max(float((high - low).max()) / (2**BITS - 1), np.finfo(float).tiny)  # of a cell
+    cells = (np.clip(np.nan_to_num(means), low, high) - low) / size
     codes = np.zeros(len(means), np.uint64)
     for axis, column in enumerate(cells.T.astype(np.uint64)):
         for bit in range(BITS):

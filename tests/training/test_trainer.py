@@ -11,6 +11,7 @@ from support.small_fits import steps
 from support.trainers import make_trainer
 
 from drgs.core.arrays import MAX_LANES
+from drgs.gaussians.morton import space_order
 from drgs.training.losses import TARGET_BYTES
 from drgs.training.steps import bytes_per_pixel
 
@@ -71,6 +72,23 @@ def test_population_may_change_without_higher_degrees():
     gaussians = trainer.gaussians()
     assert gaussians.shN.shape == (gaussians.num_gaussians, 0, 3)
     assert gaussians.num_gaussians > 40
+
+
+def test_rows_are_sorted_in_space_with_all_that_belongs_to_them():
+    trainer = steps(make_trainer(), 3)
+    population, count, (name,) = trainer.population, trainer.num_gaussians, trainer.density.by_row
+    shuffled = np.random.default_rng(0).permutation(count)
+    population.edit(population.to_device_indices(shuffled))
+    trainer.density.restore({**trainer.density.state(), name: np.arange(count)})
+    before = trainer.state()
+    trainer._sort_rows()
+    after = trainer.state()
+    rows = after[f"density/{name}"].astype(int)
+    np.testing.assert_array_equal(rows, space_order(before["means.value"]))
+    assert (rows != np.arange(count)).any()
+    for key in filter(trainer._is_by_row, before):
+        former, now = (state[key].reshape(count, -1) for state in (before, after))
+        np.testing.assert_array_equal(now, former[rows], key)
 
 
 def indices_on_device(trainer):
