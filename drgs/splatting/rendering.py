@@ -238,12 +238,12 @@ def gradients_by_row(
         d_rows, visible, d_numbers = _back_to_rows(rows, given, with_camera)
         by_row = [dr.select(visible, number, zero) for number in d_numbers]
         columns = _columns_of(d_rows, gaussians, visible, zero)
-        widths.update({name: len(each) for name, each in columns.items()}, camera=len(by_row))
+        widths.update({name: len(each) for name, each in columns.items()} | {"": len(by_row)})
         return columns, by_row, _nonfinite_flags(d_rows, visible)
 
     def skip() -> tuple[dict[str, list[Float]], list[Float], UInt32]:
         zeros = {name: [t.Float(zero) for _ in range(width)] for name, width in widths.items()}
-        return zeros, zeros.pop("camera"), t.UInt32(no_fault)
+        return zeros, zeros.pop(""), t.UInt32(no_fault)
 
     # Vectors of Gaussians that no pixel depends on are skipped; those of NaN are not.
     is_seen = reduce(or_, (~(cotangent == 0) for cotangent in cotangents))
