@@ -360,6 +360,14 @@ ELSEWHERE = {
             "self(image, target)",
         )
     },
+    **{
+        f"reduction.split_bands{site}": "test_rasterize: bands of any size"
+        for site in (
+            "running = dr.cumsum(dr.popcnt(pairs.masks))",
+            "term slots[a] of slots[b] - slots[a]",
+            "term slots[b] of slots[b] - slots[a]",
+        )
+    },
     "footprint.Cutoffs.log2_floorat_extent > least": "the package's own cut-offs are used",
     **dict.fromkeys(
         (

@@ -208,23 +208,22 @@ def sum_entries(
     group = dr.select(micros != 0, group, slots.first_group)
     spare = dr.opaque(t.UInt32, slots.band.num_slots)
 
-    def body(micros: UInt32, totals: dr.Local[Float]) -> tuple:
-        with access_all_lanes(t.Float):  # 0 is added on lanes that are not active
-            for _ in range(2):  # two at a time wait for memory together
-                active = micros != 0
+    def body(micros: UInt32, totals: list) -> tuple:
+        for _ in range(2):  # two at a time wait for memory together
+            active = micros != 0
+            with access_all_lanes(t.Float):
                 first, word = slots.locate(group, find_lowest_bit(micros))
                 slot = dr.select(active, first + dr.popcnt(word & below), spare)
-                for k, number in enumerate(partials.load(slot)):
-                    totals[k] = totals[k] + dr.select(active, number, 0)
-                micros = micros & (micros - 1)
+                numbers = partials.load(slot)
+            totals = [a + dr.select(active, b, 0) for a, b in zip(totals, numbers, strict=True)]
+            micros = micros & (micros - 1)
         return micros, totals
 
     _, totals = dr.while_loop(
-        state=(t.UInt32(micros), dr.alloc_local(t.Float, partials.width, zero)),
+        state=(t.UInt32(micros), [t.Float(zero) for _ in range(partials.width)]),
         cond=lambda micros, totals: micros != 0,
         body=body,
     )
-    totals = [totals[k] for k in range(partials.width)]
     rows = Rows.from_columns(totals)  # not as columns, which would share the sets of a cache
     dr.eval(rows)
     lane = dr.arange(t.UInt32, count)

@@ -228,10 +228,7 @@ def gradients_by_row(
     """
     if with_camera:  # an error here, and not in a branch, is not wrapped by Dr.Jit's own
         given.pipeline.model.features.check_differentiable_in_camera()
-    cotangents, widths = given.gradients.geometry + given.gradients.features, {}
-    t = types_of(type(cotangents[0]))
-    # Not literals: Dr.Jit 1.5 takes one that a branch returns for the same one behind it.
-    zero, no_fault = dr.opaque(t.Float, 0), dr.opaque(t.UInt32, NO_FAULT)
+    zero, widths = dr.opaque(type(given.gradients.geometry[0]), 0), {}
 
     def differentiate() -> tuple[dict[str, list[Float]], list[Float], UInt32]:
         rows = load_rows(gaussians, given.pipeline.sh_degree)
@@ -241,16 +238,30 @@ def gradients_by_row(
         widths.update({name: len(each) for name, each in columns.items()} | {"": len(by_row)})
         return columns, by_row, _nonfinite_flags(d_rows, visible)
 
+    is_seen, columns, by_row, faults = _where_seen(given, differentiate, widths, zero)
+    parameters = _as_tensors(columns, gaussians, [faults])
+    dr.eval(by_row)
+    return GaussianGradients(parameters, given.gradients.means2d, is_seen, dr.min(faults)), by_row
+
+
+def _where_seen(
+    given: CameraGradients, differentiate: Callable[[], tuple], widths: dict[str, int], zero: Float
+) -> tuple:
+    """Skip vectors of Gaussians that no pixel depends on; those of NaN are not skipped.
+
+    widths: filled by ``differentiate``. Zeros are no literals: Dr.Jit 1.5 takes one that a branch
+    returns for the same one behind it.
+    """
+    t = types_of(type(zero))
+    no_fault = dr.opaque(t.UInt32, NO_FAULT)
+
     def skip() -> tuple[dict[str, list[Float]], list[Float], UInt32]:
         zeros = {name: [t.Float(zero) for _ in range(width)] for name, width in widths.items()}
         return zeros, zeros.pop(""), t.UInt32(no_fault)
 
-    # Vectors of Gaussians that no pixel depends on are skipped; those of NaN are not.
+    cotangents = given.gradients.geometry + given.gradients.features
     is_seen = reduce(or_, (~(cotangent == 0) for cotangent in cotangents))
-    columns, by_row, faults = dr.if_stmt((), is_seen, differentiate, skip)
-    parameters = _as_tensors(columns, gaussians, [faults])
-    dr.eval(by_row)
-    return GaussianGradients(parameters, given.gradients.means2d, is_seen, dr.min(faults)), by_row
+    return is_seen, *dr.if_stmt((), is_seen, differentiate, skip)
 
 
 def sum_of_views(
