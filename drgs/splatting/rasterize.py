@@ -49,7 +49,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from operator import and_
+from operator import and_, or_
 from typing import Any, cast
 
 import drjit as dr
@@ -247,6 +247,10 @@ class SplatGradients:
             geometry=[a + b for a, b in zip(self.geometry, other.geometry, strict=True)],
             features=[a + b for a, b in zip(self.features, other.features, strict=True)],
         )
+
+    def are_nonzero(self) -> Bool:
+        """Return the splats that a pixel's derivative depends on, those of NaN included."""
+        return reduce(or_, (~(column == 0) for column in self.geometry + self.features))
 
     @property
     def means2d(self) -> Array2f:

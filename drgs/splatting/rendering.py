@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from operator import or_
 
 import drjit as dr
 
@@ -228,7 +227,9 @@ def gradients_by_row(
     """
     if with_camera:  # an error here, and not in a branch, is not wrapped by Dr.Jit's own
         given.pipeline.model.features.check_differentiable_in_camera()
-    zero, widths = dr.opaque(type(given.gradients.geometry[0]), 0), {}
+    t, widths = types_of(type(gaussians.logit_opacities)), {}
+    # Not literals: Dr.Jit 1.5 takes one that a branch returns for the same one behind it.
+    zero, no_fault = dr.opaque(t.Float, 0), dr.opaque(t.UInt32, NO_FAULT)
 
     def differentiate() -> tuple[dict[str, list[Float]], list[Float], UInt32]:
         rows = load_rows(gaussians, given.pipeline.sh_degree)
@@ -238,30 +239,15 @@ def gradients_by_row(
         widths.update({name: len(each) for name, each in columns.items()} | {"": len(by_row)})
         return columns, by_row, _nonfinite_flags(d_rows, visible)
 
-    is_seen, columns, by_row, faults = _where_seen(given, differentiate, widths, zero)
-    parameters = _as_tensors(columns, gaussians, [faults])
-    dr.eval(by_row)
-    return GaussianGradients(parameters, given.gradients.means2d, is_seen, dr.min(faults)), by_row
-
-
-def _where_seen(
-    given: CameraGradients, differentiate: Callable[[], tuple], widths: dict[str, int], zero: Float
-) -> tuple:
-    """Skip vectors of Gaussians that no pixel depends on; those of NaN are not skipped.
-
-    widths: filled by ``differentiate``. Zeros are no literals: Dr.Jit 1.5 takes one that a branch
-    returns for the same one behind it.
-    """
-    t = types_of(type(zero))
-    no_fault = dr.opaque(t.UInt32, NO_FAULT)
-
     def skip() -> tuple[dict[str, list[Float]], list[Float], UInt32]:
         zeros = {name: [t.Float(zero) for _ in range(width)] for name, width in widths.items()}
         return zeros, zeros.pop(""), t.UInt32(no_fault)
 
-    cotangents = given.gradients.geometry + given.gradients.features
-    is_seen = reduce(or_, (~(cotangent == 0) for cotangent in cotangents))
-    return is_seen, *dr.if_stmt((), is_seen, differentiate, skip)
+    is_seen = given.gradients.are_nonzero()
+    columns, by_row, faults = dr.if_stmt((), is_seen, differentiate, skip)
+    parameters = _as_tensors(columns, gaussians, [faults])
+    dr.eval(by_row)
+    return GaussianGradients(parameters, given.gradients.means2d, is_seen, dr.min(faults)), by_row
 
 
 def sum_of_views(
