@@ -241,18 +241,14 @@ def sum_runs(
 
     load: the numbers of an element of a run.
     """
-    width, size = len(load(begin)), dr.width(begin)
+    width, zero = len(load(begin)), dr.zeros(Float, dr.width(begin))
 
-    def body(element: UInt32, totals: dr.Local) -> tuple:
-        active = element < end
-        with access_all_lanes(Float):
-            for k, number in enumerate(load(dr.select(active, element, 0))):
-                totals[k] = totals[k] + dr.select(active, number, 0)
-        return element + 1, totals
+    def body(element: UInt32, totals: list) -> tuple:
+        return element + 1, [a + b for a, b in zip(totals, load(element), strict=True)]
 
     _, totals = dr.while_loop(
-        state=(type(begin)(begin), dr.alloc_local(Float, width, dr.zeros(Float, size))),
+        state=(type(begin)(begin), [Float(zero) for _ in range(width)]),
         cond=lambda element, totals: element < end,
         body=body,
     )
-    return [totals[k] for k in range(width)]
+    return totals

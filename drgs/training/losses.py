@@ -358,10 +358,8 @@ class _Tiling:
             values = []
             for k in range(_TILE):
                 inside = (row < self.height) & (column + k < self.width)
-                source = dr.select(inside, first + (_CHANNELS * k + channel), 0)
-                with access_all_lanes(type(flat)):
-                    value = dr.gather(type(flat), flat, source)
-                values.append(dr.select(inside, value, 0))
+                source = first + (_CHANNELS * k + channel)
+                values.append(dr.gather(type(flat), flat, source, inside))
             _store_packets(tiles, values, lane + channel * lines)
         return tiles
 

@@ -141,7 +141,10 @@ class DensityStrategy(Protocol):
         return False
 
     def refine(self, population: Population, iteration: int) -> DensityReport | None:
-        """Change rows or values; None: it was no change of the population."""
+        """Change rows or values; None: it was no change of the population.
+
+        After a change, the rows are sorted by their places in space, and :attr:`by_row` with them.
+        """
 
     def state(self) -> dict[str, np.ndarray]:
         """Return finite arrays by name: with a row for each Gaussian here, or a number."""
