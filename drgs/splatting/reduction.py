@@ -230,7 +230,8 @@ def sum_entries(
     sample, entry = divide(entry, dr.width(bins.masks), len(pairs.samples))
     first_source = sample * dr.opaque(t.UInt32, bins.num_entries)
     source = first_source + dr.gather(t.UInt32, bins.source, entry)
-    sums.store(rows.load(lane), dr.gather(t.UInt32, pairs.row, source), micros != 0)
+    is_row = micros != 0
+    sums.store(rows.load(lane), dr.gather(t.UInt32, pairs.row, source, is_row), is_row)
     dr.eval(sums)
 
 
