@@ -6,9 +6,8 @@ value). Assigning a value of another shape discards moments, step count and rate
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -23,25 +22,8 @@ if TYPE_CHECKING:
 
 _State = tuple[int, dr.ArrayBase, dr.ArrayBase, dr.ArrayBase | None]
 
-LARGE_WIDTH = 1 << 20  # entries of an array from which on memory is worth saving
-
-
-@dataclass(frozen=True)
-class _Moments:
-    """The moments of a parameter, and aliases by which they are read while they are overwritten.
-
-    Dr.Jit copies an array before it scatters to it, if anything else refers to it, as the new
-    moments do: they refer to aliases, which Dr.Jit takes for other memory.
-    """
-
-    arrays: Sequence[dr.ArrayBase]  # as in the optimizer's state
-    indices: Sequence[int]  # of the arrays: an array has another one if it was assigned to
-    former: tuple[dr.ArrayBase, dr.ArrayBase]  # of the same memory
-
-    def match(self, *arrays: dr.ArrayBase) -> bool:
-        """Return whether these are the moments still."""
-        pairs = zip(self.arrays, self.indices, arrays, strict=True)
-        return all(own is array and index == array.index for own, index, array in pairs)
+LARGE_WIDTH = 1 << 23
+"""Entries of an array from which on memory is worth 1.7 times the time."""
 
 
 class LeanAdam(Adam):
@@ -53,11 +35,6 @@ class LeanAdam(Adam):
     next kernel as soon as the last one that uses it is launched, and this is ``drjit.opt.Adam``.)
     """
 
-    def __init__(self, *arguments: Any, **settings: Any) -> None:
-        """Take the arguments of ``drjit.opt.Adam``."""
-        super().__init__(*arguments, **settings)
-        self._moments: dict[str, _Moments] = {}
-
     @override
     def step(
         self,
@@ -68,8 +45,8 @@ class LeanAdam(Adam):
     ) -> None:
         """Take a step, and clear the gradients of large arrays.
 
-        Waits only in the first step after large moments were assigned. A step that is scaled,
-        masked or not evaluated, or has more than two moments, is that of ``drjit.opt.Adam``.
+        A step that is scaled, masked or not evaluated, or has more than two moments, is that of
+        ``drjit.opt.Adam``.
         """
         is_plain = eval and grad_scale is None and active is None
         if not is_plain or self.mask_updates or self.amsgrad:
@@ -79,22 +56,13 @@ class LeanAdam(Adam):
         for key in self.state:  # one kernel each: more arrays would share the sets of a cache
             dr.eval(self._update(key, rates))
 
-    def forget_moments(self) -> None:
-        """Free memory of moments that are the parameters' no longer."""
-        self._moments.clear()
-
     def _update(self, key: str, rates: _LRCache) -> list[dr.ArrayBase]:
         """Give a parameter its new state, not evaluated, and return the arrays to evaluate."""
         value, promoted, rate, (count, first, second, _) = self.state[key]
         is_large = dr.width(value) >= LARGE_WIDTH and dr.backend_v(value) == dr.JitBackend.LLVM
         former = first, second
-        if is_large:
-            known = self._moments.get(key)
-            if known is None or not known.match(first, second):
-                former = same_memory(first), same_memory(second)  # waits for the device
-                known = _Moments((first, second), (first.index, second.index), former)
-                self._moments[key] = known
-            former = known.former
+        if is_large:  # Dr.Jit would copy what it scatters to, if it knew that this is read as well
+            former = same_memory(first), same_memory(second)
         rate_in_use = self.lr if rate is None else rate
         flat, gradient = dr.detach(value).array, value.grad.array
         new, (count, new_first, new_second, _) = self._step(

@@ -10,16 +10,16 @@ To recheck with Dr.Jit 1.6 and Mitsuba 3.10, which are not released yet:
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import drjit as dr
 
 from drgs.core.errors import UserError
-from drgs.core.types import UInt32
+from drgs.core.types import Float, UInt32
 
 if TYPE_CHECKING:
     from drjit.opt import _LRCache
@@ -39,17 +39,6 @@ def bucket_order(buckets: UInt32, block_size: int, num_buckets: int) -> UInt32:
 def same_variables(tree: object, other: object) -> bool:
     """Return whether two PyTrees consist of the same Dr.Jit variables, in the same order."""
     return dr.detail.collect_indices(tree) == dr.detail.collect_indices(other)
-
-
-def same_memory(array: dr.ArrayBase) -> dr.ArrayBase:
-    """Return another evaluated array of the same memory; LLVM only. Waits for the device.
-
-    Relies on numpy and Dr.Jit sharing memory.
-    """
-    other = type(array)(array.numpy())
-    if other.numpy().ctypes.data != array.numpy().ctypes.data:
-        raise RuntimeError("same_memory(): Dr.Jit has copied an array of numpy's")
-    return other
 
 
 def llvm_version() -> tuple[int, ...]:
@@ -91,6 +80,54 @@ def access_all_lanes(array_type: type[dr.ArrayBase]) -> Iterator[None]:
         yield
     finally:
         pop(backend)
+
+
+def same_memory(array: dr.ArrayBase) -> dr.ArrayBase:
+    """Return another array of an evaluated array's memory; see :func:`shifted_views`."""
+    return shifted_views(cast(Float, array), [0], dr.width(array))[0]
+
+
+def shifted_views(array: Float, starts: Sequence[int], size: int) -> list[Float]:
+    """Return parts of an array, ``size`` long from each start.
+
+    In the LLVM backend they are the memory of an evaluated array, loaded by whole vectors at any
+    place: ``array`` must live until they are used. Elsewhere they are gathered. Not differentiated.
+
+    Relies on ``jit_var_mem_map``, and on the device running kernels in the order of their launch.
+    """
+    if starts and not 0 <= min(starts) <= max(starts) <= dr.width(array) - size:
+        raise IndexError(f"shifted_views(): {size} of {dr.width(array)} numbers from {starts}")
+    functions = _view_functions() if dr.backend_v(array) == dr.JitBackend.LLVM else None
+    if functions is None or array.state != dr.VarState.Evaluated:
+        index = dr.arange(dr.uint32_array_t(type(array)), size)
+        opaque = partial(dr.opaque, type(index))
+        return [dr.gather(type(array), array, index + opaque(start)) for start in starts]
+    data, mem_map, release = functions
+    memory = ctypes.c_void_p()
+    held, begin = [data(array.index, ctypes.byref(memory))], cast(int, memory.value)
+    backend, number = int(dr.JitBackend.LLVM.value), dr.type_v(array)
+    item = 8 if number == dr.VarType.Float64 else 4
+    for start in starts:
+        held.append(mem_map(backend, int(number.value), begin + item * start, size, 0))
+    views = dr.detail.update_indices([type(array)(0)] * len(starts), held[1:])
+    for index in held:
+        release(index)
+    return cast("list[Float]", views)
+
+
+@cache
+def _view_functions() -> tuple[ctypes._NamedFuncPointer, ...] | None:
+    try:
+        data = _llvm_function("_Z12jit_var_datajPPv", ctypes.c_uint32)
+        mem_map = _llvm_function("_Z15jit_var_mem_map10JitBackend7VarTypePvmi", ctypes.c_uint32)
+        release = _llvm_function("_Z20jit_var_dec_ref_implj", None)
+    except (AttributeError, OSError):
+        return None
+    data.argtypes = [ctypes.c_uint32, ctypes.c_void_p]
+    number = ctypes.c_int
+    mem_map.argtypes = [number, number, ctypes.c_void_p, ctypes.c_size_t, number]
+    release.argtypes = [ctypes.c_uint32]
+    return data, mem_map, release
 
 
 @cache

@@ -8,17 +8,17 @@ similarity") is a function of five blurred maps, two of which belong to the targ
 symmetric window and zero padding is its own adjoint, so the gradient is three more blurs: nothing
 is scattered, and the result is bit-reproducible.
 
-Each channel is cut into 8 x 8 tiles. One lane computes the 8 outputs of one tile row (or column)
-from the 18 inputs that they share, which it loads as three packets of 8. Maps are blurred one after
-the other, as the inputs of one alone fit into a core's registers.
+Images are stored row by row with zeros between the rows, and a lane computes one number. A blur
+along either axis is then a weighted sum of an array with itself, shifted: views of the same memory
+(:func:`drgs.core.private.shifted_views`), which are loaded by whole vectors.
 """
 
 from __future__ import annotations
 
 import math
-import sys
+import operator
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -27,39 +27,42 @@ from typing_extensions import override
 
 from drgs.config.extensions import LOSS_TERMS, LOSSES, section_of
 from drgs.config.schema import FitConfig
-from drgs.core.arrays import MAX_LANES, is_float64, types_of
-from drgs.core.private import access_all_lanes
-from drgs.core.types import ArrayXf, Bool, Float, TensorXf, UInt32
+from drgs.core.arrays import MAX_LANES, divide, first_numbers, store_columns, types_of
+from drgs.core.private import access_all_lanes, shifted_views
+from drgs.core.types import Float, TensorXf, UInt32
 
 C1, C2 = 0.01**2, 0.03**2
 """(K L)^2 with K1 = 0.01, K2 = 0.03, dynamic range L = 1 (Wang et al. 2004, section IV)."""
 
-TARGET_BYTES = 36
-"""Memory of a pixel: three numbers for each of three channels, float32; see :class:`Target`."""
-
-_TILE = 8  # pixels; 4 and 16 were measured to be slower
-_CHANNELS = 3
+_WINDOW, _CHANNELS = 11, 3
+_PACKET = 8  # numbers that a lane copies
 
 
 @dataclass(frozen=True)
 class Target:
-    """A photograph y and the two blurs of SSIM that depend on it alone; detached, in tiles."""
+    """A photograph y and the two blurs of SSIM that depend on it alone; detached, padded."""
 
     height: int
     width: int
     weights: tuple[float, ...]  # SSIM's window along one axis, unit sum
-    values: Float  # y, display space; row order
-    means: Float  # B y; column order
-    mean_squares: Float  # B y^2; column order
+    values: Float  # y, display space; for two blurs along each axis
+    means: Float  # B y; for one
+    mean_squares: Float  # B y^2; for one; -1 beyond the image
 
     @property
     def image(self) -> TensorXf:
         """The photograph, (H, W, 3) tensor, display space."""
-        flat = _tiling(self).from_tiles(self.values)
+        flat = _Padded(_layout_of(self), self.values, 2, 2).image
         return types_of(type(flat)).TensorXf(flat, (self.height, self.width, _CHANNELS))
 
 
-def prepare_target(image: TensorXf, window: int = 11, sigma: float = 1.5) -> Target:
+def target_bytes(height: int, width: int) -> int:
+    """Return the memory of a :class:`Target` of so many pixels, float32."""
+    layout = _Layout(height, width, _WINDOW // 2)
+    return 4 * (layout.size(2, 2) + 2 * layout.size(1, 1))
+
+
+def prepare_target(image: TensorXf, window: int = _WINDOW, sigma: float = 1.5) -> Target:
     """Return the :class:`Target` of a photograph.
 
     image: (H, W, 3) tensor, display space. window: width of SSIM's Gaussian window, px, odd.
@@ -69,17 +72,18 @@ def prepare_target(image: TensorXf, window: int = 11, sigma: float = 1.5) -> Tar
     height, width = _film_size("prepare_target()", image)
     flat = dr.detach(image).array
     weights = _gaussian_window(window, sigma)
-    tiling = _Tiling(height, width, weights, dr.uint32_array_t(type(flat)))
-    values = tiling.to_tiles(flat)
-    dr.eval(values)
+    layout = _Layout(height, width, window // 2)
+    values = layout.place(flat)
 
-    y = tiling.rows.read(values)
-    maps = [tiling.rows.store_across(_blur(z, weights)) for z in (y, _product(y, y))]
-    dr.eval(maps)
-    columns = tiling.columns
-    means, mean_squares = [columns.store(_blur(columns.read(z), weights)) for z in maps]
-    dr.eval(means, mean_squares)
-    return Target(height, width, weights, values, means, mean_squares)
+    y = _Padded(layout, values, 2, 2).along_columns()
+    maps = [_blur(y, weights), _blur(map(dr.square, y), weights)]
+    _eval_each(maps)
+    means, mean_squares = (_blur(_Padded(layout, z, 1, 2).along_rows(), weights) for z in maps)
+    row, column = layout.row_and_column(type(flat), 1, 1)
+    inside = (row < height) & (column < width * _CHANNELS)
+    maps = [means, dr.select(inside, mean_squares, -1)]
+    _eval_each(maps)
+    return Target(height, width, weights, values, *maps)
 
 
 class Loss:
@@ -194,26 +198,27 @@ def l1_loss(image: TensorXf, target: TensorXf) -> Float:
 
 
 class _PhotometricOp(dr.CustomOp):
-    """Evaluates the loss and SSIM's partials by two blur passes, the gradient by two more."""
+    """Evaluates the loss and SSIM's partials by two blurs, the gradient by two more."""
 
     @override
     def eval(self, image: TensorXf, target: Target, weight: float) -> tuple[Float, Float]:
         self.target, self.weight, self.shape = target, weight, image.shape
-        self.tiling = _tiling(target)
-        self.values = self.tiling.to_tiles(image.array)
-        dr.eval(self.values)
-        blurred, absolute, squared = _blur_along_rows(self.tiling, self.values, target)
-        loss, self.partials = _ssim_and_partials(self.tiling, blurred, absolute, target, weight)
-        count = self.tiling.num_values
+        self.layout = _layout_of(target)
+        self.values = self.layout.place(image.array)
+        blurred = _blur_along_columns(self.layout, self.values, target)
+        loss, self.partials = _ssim_and_partials(self.layout, blurred, self.values, target, weight)
+        count, squared = self.layout.num_values, dr.square(self.values - target.values)
         return dr.sum(loss) / count, dr.sum(squared) / count
 
     def gradient(self) -> Float:
         """Return d loss / d image, flat, row-major; pass 3 blurs the partials along columns."""
-        columns, weights = self.tiling.columns, self.tiling.weights
-        blurred = [columns.store_across(_blur(columns.read(z), weights)) for z in self.partials]
-        dr.eval(blurred)
-        tiles = _assemble_gradient(self.tiling, blurred, self.values, self.target, self.weight)
-        return self.tiling.from_tiles(tiles)
+        layout, weights = self.layout, self.target.weights
+        partials = (_Padded(layout, each, 1, 1) for each in self.partials)
+        blurred = [_blur(each.along_columns(), weights) for each in partials]
+        _eval_each(blurred)
+        gradient = _assemble_gradient(layout, blurred, self.values, self.target, self.weight)
+        dr.eval(gradient)
+        return _Padded(layout, gradient, 0, 0).image
 
     @override
     def backward(self) -> None:
@@ -231,77 +236,64 @@ class _PhotometricOp(dr.CustomOp):
         return "PhotometricLoss"
 
 
-def _blur_along_rows(
-    tiling: _Tiling, values: Float, target: Target
-) -> tuple[list[Float], Float, Float]:
-    """Pass 1: x, x^2 and xy blurred along rows, column order; each row's |x - y| and (x - y)^2."""
-    rows = tiling.rows
-    x, y = rows.read(values), rows.read(target.values)
-    maps = (x, _product(x, x), _product(x, y))
-    blurred = [rows.store_across(_blur(z, tiling.weights)) for z in maps]
-    differences = [x[k] - y[k] for k in range(_TILE)]  # beyond the image both are 0
-    zero = type(values)(0)
-    absolute = sum(map(dr.abs, differences), zero)
-    squared = sum(map(dr.square, differences), zero)
-    dr.eval(blurred, absolute, squared)
-    return blurred, absolute, squared
+def _blur_along_columns(layout: _Layout, values: Float, target: Target) -> list[Float]:
+    """Pass 1: x, x^2 and xy blurred along columns."""
+    x, y = (_Padded(layout, z, 2, 2).along_columns() for z in (values, target.values))
+    maps = x, map(dr.square, x), map(operator.mul, x, y)
+    blurred = [_blur(taps, target.weights) for taps in maps]
+    _eval_each(blurred)
+    return blurred
 
 
 def _ssim_and_partials(
-    tiling: _Tiling, maps: list[Float], absolute: Float, target: Target, weight: float
+    layout: _Layout, maps: list[Float], values: Float, target: Target, weight: float
 ) -> tuple[Float, list[Float]]:
-    """Pass 2: each line's share of the loss, and dS/dmu_x, dS/dE[x^2], dS/dE[xy], column order.
+    """Pass 2: each number's share of the loss, and dS/dmu_x, dS/dE[x^2], dS/dE[xy].
 
     With mu = E[.] the windowed means, var and cov from E[x^2] - mu^2 and so on,
         S = A1 A2 / (B1 B2),  A1 = 2 mu_x mu_y + C1,       A2 = 2 cov_xy + C2,
                               B1 = mu_x^2 + mu_y^2 + C1,   B2 = var_x + var_y + C2
     (Wang et al. 2004, equation 13). The partials are those of S(mu_x, E[x^2], E[xy]): each of
-    the three is linear in windows of x, x^2 or xy. absolute: shares of the sum of |x - y|.
+    the three is linear in windows of x, x^2 or xy.
     """
-    columns = tiling.columns
-    blurred = [_blur(columns.read(z), tiling.weights) for z in maps]
-    means, mean_squares = columns.read_own(target.means), columns.read_own(target.mean_squares)
-    dissimilar, partials = 0, []
-    for k, (mu_x, mean_xx, mean_xy) in enumerate(zip(*blurred, strict=True)):
-        mu_y, mean_yy = means[k], mean_squares[k]
-        a1 = 2 * mu_x * mu_y + C1
-        a2 = 2 * (mean_xy - mu_x * mu_y) + C2
-        b1 = mu_x * mu_x + mu_y * mu_y + C1
-        b2 = _variance(mu_x, mean_xx) + _variance(mu_y, mean_yy) + C2
-        inv_b2 = 1 / b2
-        inv_b1b2 = inv_b2 / b1
-        ssim = a1 * a2 * inv_b1b2
-        d_mu_x = 2 * (mu_y * (a2 - a1) - mu_x * ssim * (b2 - b1)) * inv_b1b2
-        d_mean_xx = -ssim * inv_b2
-        d_mean_xy = 2 * a1 * inv_b1b2
+    blurred = [_blur(_Padded(layout, z, 1, 2).along_rows(), target.weights) for z in maps]
+    _eval_each(blurred)
+    mu_x, mean_xx, mean_xy = blurred
+    mu_y, mean_yy = target.means, target.mean_squares
+    a1 = 2 * mu_x * mu_y + C1
+    a2 = 2 * (mean_xy - mu_x * mu_y) + C2
+    b1 = mu_x * mu_x + mu_y * mu_y + C1
+    b2 = _variance(mu_x, mean_xx) + _variance(mu_y, mean_yy) + C2
+    inv_b2 = 1 / b2
+    inv_b1b2 = inv_b2 / b1
+    ssim = a1 * a2 * inv_b1b2
+    d_mu_x = 2 * (mu_y * (a2 - a1) - mu_x * ssim * (b2 - b1)) * inv_b1b2
+    d_mean_xx = -ssim * inv_b2
+    d_mean_xy = 2 * a1 * inv_b1b2
 
-        # Windows centred beyond the image are no part of the mean, nor of its adjoint.
-        inside = columns.is_inside(k)
-        dissimilar += dr.select(inside, 1 - ssim, 0)
-        partials.append([dr.select(inside, d, 0) for d in (d_mu_x, d_mean_xx, d_mean_xy)])
-    loss = (1 - weight) * absolute + weight * dissimilar
-    stored = [columns.store(list(values)) for values in zip(*partials, strict=True)]
-    dr.eval(loss, stored)
-    return loss, stored
+    # Windows centred beyond the image are no part of the mean, nor of its adjoint.
+    beyond = mean_yy < 0
+    partials = [dr.select(beyond, 0, d) for d in (d_mu_x, d_mean_xx, d_mean_xy)]
+    x, y = (_Padded(layout, z, 2, 2).crop(1, 1) for z in (values, target.values))
+    loss = (1 - weight) * dr.abs(x - y) + weight * dr.select(beyond, 0, 1 - ssim)
+    dr.eval(loss, partials)
+    return loss, partials
 
 
 def _assemble_gradient(
-    tiling: _Tiling, partials: list[Float], values: Float, target: Target, weight: float
+    layout: _Layout, partials: list[Float], values: Float, target: Target, weight: float
 ) -> Float:
-    """Pass 4: d loss / d image, row order.
+    """Pass 4: d loss / d image.
 
     The windowed means are linear in x, x^2 and xy, and the blur B is its own adjoint:
         d (sum of S) / dx = B dS/dmu_x + 2 x B dS/dE[x^2] + y B dS/dE[xy].
     """
-    rows = tiling.rows
-    own = rows.read_own(values), rows.read_own(target.values)
-    blurred = [_blur(rows.read(z), tiling.weights) for z in partials]
-    gradient = []
-    for x, y, d_mu_x, d_mean_xx, d_mean_xy in zip(*own, *blurred, strict=True):
-        d_ssim = d_mu_x + 2 * x * d_mean_xx + y * d_mean_xy
-        d_loss = (1 - weight) * _sign(x - y) - weight * d_ssim
-        gradient.append(d_loss / tiling.num_values)
-    return rows.store(gradient)
+    d_mu_x, d_mean_xx, d_mean_xy = (
+        _blur(_Padded(layout, z, 0, 1).along_rows(), target.weights) for z in partials
+    )
+    x, y = (_Padded(layout, z, 2, 2).crop(0, 0) for z in (values, target.values))
+    d_ssim = d_mu_x + 2 * x * d_mean_xx + y * d_mean_xy
+    return ((1 - weight) * _sign(x - y) - weight * d_ssim) / layout.num_values
 
 
 def _variance(mean: Float, mean_square: Float) -> Float:
@@ -315,17 +307,16 @@ def _sign(x: Float) -> Float:
 
 
 @dataclass(frozen=True)
-class _Tiling:
-    """The layout of an (H, W, 3) image in memory: 8 x 8 tiles of one channel.
+class _Layout:
+    """Where numbers of an (H, W, 3) image are: row by row, with at least a window's zeros between.
 
-    Tiles are ordered (channel, tile row, tile column). Within a tile, pixels are in *row order*
-    (the 8 pixels of a row contiguous) or in *column order*. The last tiles are filled with zeros.
+    An array goes on before the first row and behind the last one, as far as the windows of all
+    blurs reach that are still to come: so many along columns, and along rows.
     """
 
     height: int
     width: int
-    weights: tuple[float, ...]
-    index_type: type  # UInt32 of the image's backend
+    radius: int  # of the window, pixels
 
     @property
     def num_values(self) -> int:
@@ -333,171 +324,122 @@ class _Tiling:
         return self.height * self.width * _CHANNELS
 
     @property
-    def grid(self) -> tuple[int, int]:
-        """Tiles from top to bottom and from left to right."""
-        return -(-self.height // _TILE), -(-self.width // _TILE)
+    def stride(self) -> int:
+        """Numbers from a row to the next one."""
+        return _whole_vectors((self.width + self.radius) * _CHANNELS)
 
-    @property
-    def num_lines(self) -> int:
-        """Rows (or columns) of all tiles of all channels."""
-        return _CHANNELS * math.prod(self.grid) * _TILE
+    def start(self, columns: int, rows: int) -> int:
+        """Return where the first row starts in an array for so many blurs."""
+        ends = _whole_vectors(self.radius * _CHANNELS)
+        return columns * self.radius * self.stride + rows * ends
 
-    def empty(self, float_type: type[Float]) -> Float:
-        """Allocate an image in tiles, and lines behind it for lanes that only fill up a vector."""
-        return dr.empty(float_type, (self.num_lines + MAX_LANES) * _TILE)
+    def size(self, columns: int, rows: int) -> int:
+        """Return the size of such an array."""
+        return self.height * self.stride + 2 * self.start(columns, rows)
 
-    def to_tiles(self, flat: Float) -> Float:
-        """Bring a row-major (H, W, 3) image into tiles, row order; one lane a row, all channels."""
-        lines = self.num_lines // _CHANNELS
-        lane = dr.arange(self.index_type, lines)
-        _, tile_row, tile_column = self.split(lane // _TILE)
-        row, column = tile_row * _TILE + lane % _TILE, tile_column * _TILE
-        first = (row * self.width + column) * _CHANNELS
-        tiles = self.empty(type(flat))
-        for channel in range(_CHANNELS):
-            values = []
-            for k in range(_TILE):
-                inside = (row < self.height) & (column + k < self.width)
-                source = first + (_CHANNELS * k + channel)
-                values.append(dr.gather(type(flat), flat, source, inside))
-            _store_packets(tiles, values, lane + channel * lines)
-        return tiles
+    def place(self, flat: Float) -> Float:
+        """Return a row-major (H, W, 3) image for two blurs along each axis."""
+        row, column = self.row_and_column(type(flat), 2, 2, _PACKET)
+        size = dr.opaque(type(row), self.width * _CHANNELS)
+        first, is_row = row * size + column, row < dr.opaque(type(row), self.height)
+        values = []
+        with access_all_lanes(type(flat)):
+            for k in range(_PACKET):
+                inside = is_row & (column + k < size)
+                value = dr.gather(type(flat), flat, dr.select(inside, first + k, 0))
+                values.append(dr.select(inside, value, 0))
+        stored = store_columns(values)
+        dr.eval(stored)
+        return first_numbers(stored, self.size(2, 2))
 
-    def from_tiles(self, tiles: Float) -> Float:
-        """Bring tiles in row order back to a row-major (H, W, 3) image, not evaluated."""
-        index = dr.arange(self.index_type, self.num_values)
-        pixel, channel = index // _CHANNELS, index % _CHANNELS
-        row, column = pixel // self.width, pixel % self.width
-        rows, columns = self.grid
-        tile = (channel * rows + row // _TILE) * columns + column // _TILE
-        return dr.gather(type(tiles), tiles, (tile * _TILE + row % _TILE) * _TILE + column % _TILE)
+    def row_and_column(
+        self, float_type: type[Float], columns: int, rows: int, packet: int = 1
+    ) -> tuple[UInt32, UInt32]:
+        """Return the row of each packet's first number, and its place there.
 
-    def split(self, tile: UInt32) -> tuple[UInt32, UInt32, UInt32]:
-        """Channel, tile row and tile column of a tile's index."""
-        rows, columns = self.grid
-        strip = tile // columns
-        return strip // rows, strip % rows, tile % columns
-
-    @property
-    def rows(self) -> _Lines:
-        """Lanes of tile rows."""
-        return _Lines(self, stride=1, axis=1)
-
-    @property
-    def columns(self) -> _Lines:
-        """Lanes of tile columns."""
-        return _Lines(self, stride=self.grid[1], axis=0)
+        Rows before the first one are numbers above 2^31.
+        """
+        index, start = types_of(float_type).UInt32, self.start(columns, rows)
+        rows_before = -(-start // self.stride)
+        numbers = dr.arange(index, self.size(columns, rows) // packet) * packet
+        numbers += dr.opaque(index, rows_before * self.stride - start)
+        row, column = divide(numbers, self.stride, 2)
+        return row - rows_before, column
 
 
 @dataclass(frozen=True)
-class _Lines:
-    """The lanes of one pass: lane (tile, line) owns a row (column) of 8 pixels in a tile."""
+class _Padded:
+    """An image as :class:`_Layout` has it, for so many blurs along columns and along rows."""
 
-    tiling: _Tiling
-    axis: int  # 0: lines are columns, 1: rows
-    stride: int  # from a tile to the next one along a line
+    layout: _Layout
+    values: Float
+    columns: int
+    rows: int
 
     @property
-    def lane(self) -> UInt32:
-        return dr.arange(self.tiling.index_type, self.tiling.num_lines)
+    def image(self) -> Float:
+        """The row-major (H, W, 3) array, not evaluated."""
+        layout = self.layout
+        index = dr.arange(types_of(type(self.values)).UInt32, layout.num_values)
+        row, column = divide(index, layout.width * _CHANNELS, layout.height)
+        source = row * dr.opaque(type(index), layout.stride) + column
+        return dr.gather(type(self.values), self.values, source + self._start)
 
-    def is_inside(self, k: int) -> Bool:
-        """Return whether the line's k-th pixel belongs to the image."""
-        line, (_, *tile) = self.lane % _TILE, self.tiling.split(self.lane // _TILE)
-        along = tile[self.axis] * _TILE + k
-        across = tile[1 - self.axis] * _TILE + line
-        size = self.tiling.height, self.tiling.width
-        return (along < size[self.axis]) & (across < size[1 - self.axis])
+    def along_columns(self) -> list[Float]:
+        """Return the values at each pixel of windows along columns, for one blur less."""
+        return self._shifted(self.columns - 1, self.rows, self.layout.stride)
 
-    def read_own(self, values: Float) -> ArrayXf:
-        """Return the line's own 8 values; ``values`` contiguous along lines."""
-        return self._read_packet(values, self.lane, True)
+    def along_rows(self) -> list[Float]:
+        """Return the values at each pixel of windows along rows, for one blur less."""
+        return self._shifted(self.columns, self.rows - 1, _CHANNELS)
 
-    def read(self, values: Float) -> dict[int, Float]:
-        """Return the inputs of the line's 8 outputs by pixel, from its tile's edge; 0 beyond tiles.
+    def crop(self, columns: int, rows: int) -> Float:
+        """Return the values for less blurs."""
+        start = self._start - self.layout.start(columns, rows)
+        return shifted_views(self.values, [start], self.layout.size(columns, rows))[0]
 
-        values: contiguous along lines.
-        """
-        packets = [self._read_packet(values, *self._neighbour(step)) for step in (-1, 0, 1)]
-        radius = len(self.tiling.weights) // 2
-        return {k: packets[1 + k // _TILE][k % _TILE] for k in range(-radius, _TILE + radius)}
+    @property
+    def _start(self) -> int:
+        return self.layout.start(self.columns, self.rows)
 
-    def store(self, values: list[Float]) -> Float:
-        """Store each line's 8 values, contiguous along lines."""
-        flat = self.tiling.empty(type(values[0]))
-        with access_all_lanes(type(flat)):
-            _store_packets(flat, values, self.lane)
-        return flat
-
-    def store_across(self, values: list[Float]) -> Float:
-        """Store them contiguous across lines: rows in column order, columns in row order."""
-        flat = self.tiling.empty(type(values[0]))
-        line = self.lane % _TILE
-        first = (self.lane - line) * _TILE + line
-        with access_all_lanes(type(flat)):
-            for k, value in enumerate(values):
-                dr.scatter(flat, value, first + k * _TILE, mode=dr.ReduceMode.NoConflicts)
-        return flat
-
-    def _read_packet(self, values: Float, line: UInt32, valid: Bool | bool) -> ArrayXf:
-        shape = (_TILE, self.tiling.num_lines)
-        return dr.gather(_packet_type(type(values)), values, line, valid, shape=shape)
-
-    def _neighbour(self, step: int) -> tuple[UInt32, Bool | bool]:
-        """Return the same line in the tile ``step`` further along it, and whether there is one."""
-        coordinate = self.tiling.split(self.lane // _TILE)[1 + self.axis]
-        if step < 0:
-            return self.lane - self.stride * _TILE, coordinate > 0
-        if step > 0:
-            return self.lane + self.stride * _TILE, coordinate + 1 < self.tiling.grid[self.axis]
-        return self.lane, True
+    def _shifted(self, columns: int, rows: int, step: int) -> list[Float]:
+        start, radius = self._start - self.layout.start(columns, rows), self.layout.radius
+        starts = [start + k * step for k in range(-radius, radius + 1)]
+        return shifted_views(self.values, starts, self.layout.size(columns, rows))
 
 
-def _store_packets(flat: Float, values: list[Float], index: UInt32) -> None:
-    """Store 8 values a lane as packet ``index`` of an array, which no other lane fills.
+def _whole_vectors(count: int) -> int:
+    return -(-count // MAX_LANES) * MAX_LANES
 
-    ``NoConflicts`` lets several stores into one array share a kernel.
+
+def _blur(taps: Iterable[Float], weights: tuple[float, ...]) -> Float:
+    """Return the weighted sum of a window's pixels."""
+    total: Any = 0
+    for tap, weight in zip(taps, weights, strict=True):
+        total = dr.fma(tap, weight, total)
+    return total
+
+
+def _eval_each(maps: Sequence[Float]) -> None:
+    """Evaluate maps in kernels of their own: one that stores three takes three times as long.
+
+    Dr.Jit stores results past the caches, and loads of many rows disturb several such streams.
     """
-    dr.scatter(flat, _packet_type(type(flat))(values), index, mode=dr.ReduceMode.NoConflicts)
+    for each in maps:
+        dr.eval(each)
 
 
-def _product(x: dict[int, Float], y: dict[int, Float]) -> dict[int, Float]:
-    return {k: x[k] * y[k] for k in x}
-
-
-def _blur(values: dict[int, Float], weights: tuple[float, ...]) -> list[Float]:
-    """Return a blurred map at the line's 8 pixels; values: see :meth:`_Lines.read`."""
-    radius = len(weights) // 2
-    blurred = []
-    for k in range(_TILE):
-        total = 0
-        for offset, weight in enumerate(weights, start=k - radius):
-            total = dr.fma(values[offset], weight, total)
-        blurred.append(total)
-    return blurred
-
-
-def _tiling(target: Target) -> _Tiling:
-    index_type = dr.uint32_array_t(type(target.values))
-    return _Tiling(target.height, target.width, target.weights, index_type)
+def _layout_of(target: Target) -> _Layout:
+    return _Layout(target.height, target.width, len(target.weights) // 2)
 
 
 def _gaussian_window(window: int, sigma: float) -> tuple[float, ...]:
-    widest = 2 * _TILE + 1  # only adjacent tiles are read
-    if window not in range(1, widest + 1, 2):
-        raise ValueError(
-            f"prepare_target(): window must be odd and at most {widest} pixels, got {window}"
-        )
+    if window < 1 or window % 2 == 0:
+        raise ValueError(f"prepare_target(): window must be odd, in pixels, got {window}")
     if not sigma > 0:
         raise ValueError(f"prepare_target(): sigma must be > 0 pixels, got {sigma}")
     weights = [math.exp(-0.5 * ((k - window // 2) / sigma) ** 2) for k in range(window)]
     return tuple(weight / sum(weights) for weight in weights)
-
-
-def _packet_type(float_type: type) -> type:
-    """Return the array type of any number of ``float_type`` components."""
-    name = "ArrayXf64" if is_float64(float_type) else "ArrayXf"
-    return getattr(sys.modules[float_type.__module__], name)
 
 
 def _film_size(where: str, image: TensorXf) -> tuple[int, int]:

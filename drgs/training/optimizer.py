@@ -118,7 +118,6 @@ class Population:
         added = self._num_appended(append)
         if dr.width(keep) + added == 0:
             raise ValueError("Population.edit(): at least one row must remain, got none")
-        optimizer.forget_moments()
         for name, (value, promoted, rate, (step, first, second, _)) in optimizer.state.items():
             row_shape = tuple(value.shape[1:])
             width = math.prod(row_shape)

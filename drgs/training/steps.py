@@ -21,7 +21,7 @@ from drgs.datasets.types import View
 from drgs.effects.base import TrainingEffect
 from drgs.integrator.scene import make_sensors
 from drgs.integrator.state import SplatsPlugin
-from drgs.training.losses import TARGET_BYTES
+from drgs.training.losses import target_bytes
 from drgs.training.rates import LearningRates
 from drgs.training.views import TrainingView
 
@@ -37,7 +37,7 @@ class ResolutionPhase:
 
     until: float  # last iteration
     shifted: list[list[TrainingView]]  # of each view, itself first: see images.shift_pixels
-    pixel_bytes: int  # see bytes_per_pixel
+    upload_bytes: int  # memory of a pixel in effects' uploads
     room: int  # bytes left for targets and uploads that stay on the device
     kept: set[TrainingView] = field(default_factory=set)  # their views
 
@@ -58,7 +58,8 @@ class ResolutionPhase:
         """
         if view in self.kept:
             return
-        size = view.width * view.height * self.pixel_bytes
+        size = target_bytes(view.height, view.width)
+        size += view.width * view.height * self.upload_bytes
         if size > self.room:
             view.free()
         else:
@@ -82,6 +83,7 @@ def make_phases(
     """
     room = 0 if any(map(is_on_disk, views)) else min(room, MAX_TARGET_BYTES)
     sizes = [(s.until, [smaller_view(v, s.factor) for v in views]) for s in config.coarse]
+    upload_bytes = sum(effect.upload_bytes for effect in effects)
     is_refined = any(effect.moves_sensors for effect in effects)
     phases = []
     for until, resized in [*sizes, (math.inf, views)]:
@@ -91,7 +93,7 @@ def make_phases(
             [TrainingView(view, index, next(sensors), effects) for view in views_of_one]
             for index, views_of_one in enumerate(shifted)
         ]
-        phases.append(ResolutionPhase(until, training_views, bytes_per_pixel(effects), room))
+        phases.append(ResolutionPhase(until, training_views, upload_bytes, room))
     return phases
 
 
@@ -112,11 +114,6 @@ class ReadAhead:
             own = (view for view in coming if view.index in self._own)
             for view in islice(own, 1 + NUM_AHEAD):
                 view.read_ahead(self._thread)
-
-
-def bytes_per_pixel(effects: Sequence[TrainingEffect]) -> int:
-    """Return the memory of a view's pixel on the device: its target, and effects' uploads."""
-    return TARGET_BYTES + sum(effect.upload_bytes for effect in effects)
 
 
 @dataclass(frozen=True)

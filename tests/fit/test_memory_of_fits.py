@@ -17,7 +17,7 @@ from drgs.config.schema import FitConfig
 from drgs.core.errors import UserError
 from drgs.datasets.types import Dataset, LazyImage, View
 from drgs.fit import memory
-from drgs.training.losses import TARGET_BYTES
+from drgs.training.losses import target_bytes
 from drgs.training.parallel.communicator import Communicator
 
 GB = 10**9
@@ -60,7 +60,7 @@ def estimated(config, dataset, scale=1.0, processes=1):
 def test_estimates_are_what_was_measured(size, start, most, views, measured_mb):
     """Peaks of resident memory, MiB, of fits that grew to their cap, with all targets kept."""
     peak = estimated(config_of(start, most), dataset_of(size, size, views))
-    expected = peak.required_bytes + TARGET_BYTES * size * size * views
+    expected = peak.required_bytes + target_bytes(size, size) * views
     assert expected / 2**20 == pytest.approx(measured_mb, rel=0.18)
 
 
@@ -218,8 +218,8 @@ def test_the_peak_of_a_fit_is_within_a_quarter_of_the_estimate(
     }
     (tmp_path / "a.yml").write_text(yaml.safe_dump(config))
     arguments = ["a.yml", "--out", "out"]
-    target_bytes = in_memory * TARGET_BYTES * size * size * views  # else none stay
-    script = f"import sys; sys.argv[1:] = {arguments}; TARGET_BYTES = {target_bytes}\n{MEASURED}"
+    of_targets = in_memory * views * target_bytes(size, size)  # else none stay
+    script = f"import sys; sys.argv[1:] = {arguments}; TARGET_BYTES = {of_targets}\n{MEASURED}"
     done = run_python(script, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     _, expected, peak = next(x for x in done.stdout.splitlines() if x.startswith("peak ")).split()

@@ -10,10 +10,8 @@ from support.kernels import kernel_hashes
 from support.small_fits import steps
 from support.trainers import make_trainer
 
-from drgs.core.arrays import MAX_LANES
 from drgs.gaussians.morton import space_order
-from drgs.training.losses import TARGET_BYTES
-from drgs.training.steps import bytes_per_pixel
+from drgs.training.losses import target_bytes
 
 
 def test_sh_degree_increases_by_one_at_fixed_intervals():
@@ -100,7 +98,7 @@ def indices_on_device(trainer):
 
 
 def test_targets_are_cached_within_the_memory_limit():
-    trainer, seen = make_trainer(room=2 * 20 * 16 * TARGET_BYTES + 7), []
+    trainer, seen = make_trainer(room=2 * target_bytes(16, 20) + 7), []
     assert indices_on_device(trainer) == [set()]
     for _ in range(8):  # two rounds of four views
         trainer.step()
@@ -133,9 +131,9 @@ def test_device_memory_of_a_view_is_counted():
     arrays = [view.photograph.values, view.photograph.means, view.photograph.mean_squares]
     arrays += [view.uploads["colors"].array, view.uploads["background"].array]
     arrays += view.uploads["depth"]
-    count = sum(len(array) for array in arrays) * 4
-    padding = count - view.width * view.height * bytes_per_pixel(trainer.effects)
-    assert 0 <= padding <= 3 * MAX_LANES * 8 * 4, "lines that only fill up a vector"
+    stored = 4 * sum(len(array) for array in arrays)
+    of_uploads = sum(effect.upload_bytes for effect in trainer.effects) * view.width * view.height
+    assert stored == target_bytes(view.height, view.width) + of_uploads
 
 
 def test_finished_stage_leaves_no_arrays_on_the_device():

@@ -155,7 +155,6 @@ class ShardedPopulation(Population):
         _check_count(after.total, after.size)
         move = self._row_moves(after, kept)
         first, end = (max(row - len(kept), 0) for row in (after.local.start, after.local.stop))
-        optimizer.forget_moments()
         for name, (value, promoted, rate, (step, *moments, maximum)) in optimizer.state.items():
             appended = np.empty((0, *value.shape[1:]), np.float32)
             if append is not None:
