@@ -124,11 +124,12 @@ def bin_splats(table: SplatTable, grid: TileGrid, model: ImageModel) -> TileBins
     # A stable sort: equal depths stay in the order of the Gaussians.
     order = t.UInt32(dr.argsort(depths))
     # In a separate kernel: loads without arithmetic overlap their latencies.
+    ordered = boxes.load(order)
     by_depth = _ByDepth(
         order,
         dr.gather(t.UInt32, first_entry, order),
-        dr.gather(t.UInt32, counts, order),
-        Rows.from_columns(boxes.load(order)),
+        t.UInt32(ordered[-1]),
+        Rows.from_columns(ordered),
         Rows.from_columns(rows.load(order)[: model.falloff.num_geometry]),
     )
     dr.eval(by_depth)
