@@ -135,6 +135,11 @@ def repeat_array(values: Array, count: int, step: int = 0) -> Array:
     return copies + part * dr.opaque(UInt32, step) if step else copies
 
 
+def existing_lanes(index_type: type[Array], count: int) -> Array:
+    """Return 0 .. count - 1, and the last number again on lanes that only fill up a vector."""
+    return dr.minimum(dr.arange(index_type, count), dr.opaque(index_type, count - 1))
+
+
 def store_in_all_lanes(array_type: type[dr.ArrayBase], num_rows: int) -> AbstractContextManager:
     """Let lanes that only fill up a vector store rows, too, behind the others: without a branch.
 
@@ -384,8 +389,9 @@ _VECTORS = {
 def planes_of(image: dr.ArrayBase) -> list[Float]:
     """Return the channels of an image (H, W, C), each (H * W,), detached."""
     flat, count = dr.detach(image).array, image.shape[2]
-    pixel = dr.arange(types_of(type(flat)).UInt32, image.shape[0] * image.shape[1])
-    return [dr.gather(type(flat), flat, pixel * count + k) for k in range(count)]
+    pixel = existing_lanes(types_of(type(flat)).UInt32, image.shape[0] * image.shape[1])
+    with access_all_lanes(type(flat)):
+        return [dr.gather(type(flat), flat, pixel * count + k) for k in range(count)]
 
 
 def image_of(planes: Sequence[dr.ArrayBase], like: Array) -> Array:

@@ -54,7 +54,15 @@ from typing import Any, cast
 
 import drjit as dr
 
-from drgs.core.arrays import Rows, divide, quotient, reinterpret, scatter_rows, types_of
+from drgs.core.arrays import (
+    Rows,
+    divide,
+    existing_lanes,
+    quotient,
+    reinterpret,
+    scatter_rows,
+    types_of,
+)
 from drgs.core.private import access_all_lanes
 from drgs.core.types import Array2f, Bool, Float, Int32, UInt32
 from drgs.splatting.footprint import Alpha, SplatFeatures
@@ -99,7 +107,8 @@ class CompositedTiles:
     def unpack(self, values: Float) -> list[Float]:
         """Return planes, from numbers that are stored as ``values`` are."""
         t = types_of(type(values))
-        pixel, grid = dr.arange(t.UInt32, self.bins.grid.num_pixels), self.bins.grid
+        grid = self.bins.grid
+        pixel = existing_lanes(t.UInt32, grid.num_pixels)
         y = quotient(pixel, grid.width)
         x = pixel - y * dr.opaque(t.UInt32, grid.width)
         sample, y = divide(y, grid.height, grid.samples)
@@ -108,7 +117,8 @@ class CompositedTiles:
         micro = ((y % TILE) // MICRO) * GRID + (x % TILE) // MICRO
         base = (tile * MICROS + micro) * (PIXELS * (1 + self.count))
         index = base + (y % MICRO) * MICRO + x % MICRO
-        return [dr.gather(t.Float, values, index + PIXELS * k) for k in range(1 + self.count)]
+        with access_all_lanes(t.Float):
+            return [dr.gather(t.Float, values, index + PIXELS * k) for k in range(1 + self.count)]
 
 
 def composite_step(transmittance: Float, alpha: Float, stop: float) -> tuple[Float, Float, Bool]:

@@ -27,7 +27,14 @@ from typing_extensions import override
 
 from drgs.config.extensions import LOSS_TERMS, LOSSES, section_of
 from drgs.config.schema import FitConfig
-from drgs.core.arrays import MAX_LANES, divide, first_numbers, store_columns, types_of
+from drgs.core.arrays import (
+    MAX_LANES,
+    divide,
+    existing_lanes,
+    first_numbers,
+    store_columns,
+    types_of,
+)
 from drgs.core.private import access_all_lanes, shifted_views
 from drgs.core.types import Float, TensorXf, UInt32
 
@@ -308,7 +315,7 @@ def _sign(x: Float) -> Float:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where numbers of an (H, W, 3) image are: row by row, with at least a window's zeros between.
+    """Places of an (H, W, 3) image's numbers: row by row, with at least a window's zeros between.
 
     An array goes on before the first row and behind the last one, as far as the windows of all
     blurs reach that are still to come: so many along columns, and along rows.
@@ -380,18 +387,19 @@ class _Padded:
     def image(self) -> Float:
         """The row-major (H, W, 3) array, not evaluated."""
         layout = self.layout
-        index = dr.arange(types_of(type(self.values)).UInt32, layout.num_values)
+        index = existing_lanes(types_of(type(self.values)).UInt32, layout.num_values)
         row, column = divide(index, layout.width * _CHANNELS, layout.height)
         source = row * dr.opaque(type(index), layout.stride) + column
-        return dr.gather(type(self.values), self.values, source + self._start)
+        with access_all_lanes(type(self.values)):
+            return dr.gather(type(self.values), self.values, source + self._start)
 
     def along_columns(self) -> list[Float]:
         """Return the values at each pixel of windows along columns, for one blur less."""
-        return self._shifted(self.columns - 1, self.rows, self.layout.stride)
+        return self._views(self.columns - 1, self.rows, self.layout.stride)
 
     def along_rows(self) -> list[Float]:
         """Return the values at each pixel of windows along rows, for one blur less."""
-        return self._shifted(self.columns, self.rows - 1, _CHANNELS)
+        return self._views(self.columns, self.rows - 1, _CHANNELS)
 
     def crop(self, columns: int, rows: int) -> Float:
         """Return the values for less blurs."""
@@ -402,7 +410,7 @@ class _Padded:
     def _start(self) -> int:
         return self.layout.start(self.columns, self.rows)
 
-    def _shifted(self, columns: int, rows: int, step: int) -> list[Float]:
+    def _views(self, columns: int, rows: int, step: int) -> list[Float]:
         start, radius = self._start - self.layout.start(columns, rows), self.layout.radius
         starts = [start + k * step for k in range(-radius, radius + 1)]
         return shifted_views(self.values, starts, self.layout.size(columns, rows))

@@ -27,7 +27,7 @@ from drgs.training.views import TrainingView
 
 MAX_TARGET_BYTES = 2 << 30
 """Most memory of targets and effects' uploads that stay on the device until their view is drawn
-again: 370 images of 400 x 400 px. Recomputing one takes a tenth of an iteration, or a fifth where
+again: 350 images of 400 x 400 px. Recomputing one takes a tenth of an iteration, or a fifth where
 the file has four times the pixels."""
 
 

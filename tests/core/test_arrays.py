@@ -8,7 +8,7 @@ import pytest
 from support.helpers import both_precisions
 from support.kernels import kernel_hashes
 
-from drgs.core import arrays
+from drgs.core import arrays, private
 
 UInt32, Bool = dr.llvm.ad.UInt32, dr.llvm.ad.Bool
 
@@ -52,6 +52,29 @@ def test_contiguous_rows_are_loaded_and_stored(precision, width, num_rows):
     stored = arrays.store_columns(numbered(precision, width, num_rows))
     dr.eval(stored)
     np.testing.assert_array_equal(arrays.first_numbers(stored, num_rows * width), np.array(flat))
+
+
+@both_precisions
+@pytest.mark.parametrize("is_evaluated", [True, False])
+def test_shifted_views_are_parts_of_an_array(precision, is_evaluated, monkeypatch):
+    """They share its memory, or are gathered where Dr.Jit has no such functions."""
+    expected = np.arange(80) * 2.0
+    for functions in (private._view_functions, lambda: None):
+        monkeypatch.setattr(private, "_view_functions", functions)
+        array = dr.arange(precision.Float, 80) * 2
+        if is_evaluated:
+            dr.eval(array)
+        views = private.shifted_views(array, [0, 3, 17], 63)
+        for start, view in zip((0, 3, 17), views, strict=True):
+            np.testing.assert_array_equal(np.array(view + 1), expected[start:][:63] + 1)
+        literal = private.shifted_views(dr.full(precision.Float, 3, 9), [2], 7)
+        np.testing.assert_array_equal(np.array(literal[0]), np.full(7, 3.0))
+
+
+@pytest.mark.parametrize("starts", [[-1, 2], [0, 4]])
+def test_views_beyond_an_array_are_refused(starts):
+    with pytest.raises(IndexError, match=r"shifted_views\(\): 7 of 10 numbers from "):
+        private.shifted_views(dr.arange(dr.llvm.Float, 10), starts, 7)
 
 
 def test_alignment_of_numpy_arrays_does_not_affect_kernels():
