@@ -84,7 +84,8 @@ def exact_images(scene):
     return [reference_rays.render(of_numpy, one, BLACK, model).image for one in cameras[1::2]]
 
 
-@pytest.mark.parametrize("budget", [0.05, pytest.param(0.01, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("budget", [0.05, 0.01])
 def test_other_views_are_within_the_budget_of_exact_images(scene, found, exact_images, budget):
     chosen = found.choose(budget).chosen.approximations
     for camera, expected in zip(scene[1][1::2], exact_images, strict=True):
@@ -108,6 +109,7 @@ def test_smaller_budgets_cost_more_and_the_choice_is_the_same_in_every_run(scene
         assert report.better is None or report.better.error < report.chosen.error
 
 
+@pytest.mark.slow
 def test_filters_and_other_settings_are_kept(scene):
     given = Approximations(low_pass=0.1, antialiased=True, alpha_max=0.9, extent=4.0)
     chosen = search(scene, given).choose(0.05).chosen

@@ -384,6 +384,7 @@ def test_poses_lit_by_other_surfaces_are_differentiated():
     assert measure(case, "`splatpath`").error < 0.01
 
 
+@pytest.mark.slow
 def test_scenes_are_freed_although_a_layer_does_not_depend_on_the_parameter():
     """Not by a later collection: during a trace, Dr.Jit would end the program."""
     case, is_enabled = cases()["`thindielectric` `specular_reflectance`"], gc.isenabled()

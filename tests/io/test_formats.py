@@ -150,7 +150,8 @@ def test_damaged_files_are_read_or_refused_by_file(tmp_path, each):
 def test_truncated_file_is_refused_at_any_length(tmp_path, each):
     path = tmp_path / f"a{each.value.suffix}"
     content = gaussians_within_ranges(1, degree=1).to_bytes(each.name)
-    for end in range(0, len(content), max(1, len(content) // 200)):
+    count = 20 if each.name == "usd" else 200  # USD is read in a process of its own
+    for end in range(0, len(content), max(1, len(content) // count)):
         path.write_bytes(content[:end])
         assert refusal(path)
 

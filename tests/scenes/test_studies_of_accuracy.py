@@ -184,12 +184,7 @@ SLOW_KINDS = ("wide fisheye", "rolling shutter", "surface and environment")
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "8 x 8 pixels",
-        "rolling shutter",
-        *(pytest.param(k, marks=pytest.mark.slow) for k in SLOW_KINDS),
-    ],
+    "name", ["8 x 8 pixels", *(pytest.param(k, marks=pytest.mark.slow) for k in SLOW_KINDS)]
 )
 def test_error_budgets_hold_at_views_that_were_not_measured(name):
     """One view in twenty may exceed them, by half at most: here there are six."""
