@@ -88,9 +88,9 @@ def prepare_target(image: TensorXf, window: int = _WINDOW, sigma: float = 1.5) -
     means, mean_squares = (_blur(_Padded(layout, z, 1, 2).along_rows(), weights) for z in maps)
     row, column = layout.row_and_column(type(flat), 1, 1)
     inside = (row < height) & (column < width * _CHANNELS)
-    maps = [means, dr.select(inside, mean_squares, -1)]
-    _eval_each(maps)
-    return Target(height, width, weights, values, *maps)
+    results = [means, dr.select(inside, mean_squares, -1)]  # views of the maps, which must live
+    _eval_each(results)
+    return Target(height, width, weights, values, *results)
 
 
 class Loss:
@@ -394,15 +394,15 @@ class _Padded:
             return dr.gather(type(self.values), self.values, source + self._start)
 
     def along_columns(self) -> list[Float]:
-        """Return the values at each pixel of windows along columns, for one blur less."""
+        """Return the values at each pixel of windows along columns, for one blur fewer."""
         return self._views(self.columns - 1, self.rows, self.layout.stride)
 
     def along_rows(self) -> list[Float]:
-        """Return the values at each pixel of windows along rows, for one blur less."""
+        """Return the values at each pixel of windows along rows, for one blur fewer."""
         return self._views(self.columns, self.rows - 1, _CHANNELS)
 
     def crop(self, columns: int, rows: int) -> Float:
-        """Return the values for less blurs."""
+        """Return the part for fewer blurs."""
         start = self._start - self.layout.start(columns, rows)
         return shifted_views(self.values, [start], self.layout.size(columns, rows))[0]
 
