@@ -87,7 +87,8 @@ def prepare_target(image: TensorXf, window: int = _WINDOW, sigma: float = 1.5) -
     _eval_each(maps)
     means, mean_squares = (_blur(_Padded(layout, z, 1, 2).along_rows(), weights) for z in maps)
     row, column = layout.row_and_column(type(flat), 1, 1)
-    inside = (row < height) & (column < width * _CHANNELS)
+    rows, columns = (dr.opaque(type(row), count) for count in (height, width * _CHANNELS))
+    inside = (row < rows) & (column < columns)
     results = [means, dr.select(inside, mean_squares, -1)]  # views of the maps, which must live
     _eval_each(results)
     return Target(height, width, weights, values, *results)
@@ -214,8 +215,8 @@ class _PhotometricOp(dr.CustomOp):
         self.values = self.layout.place(image.array)
         blurred = _blur_along_columns(self.layout, self.values, target)
         loss, self.partials = _ssim_and_partials(self.layout, blurred, self.values, target, weight)
-        count, squared = self.layout.num_values, dr.square(self.values - target.values)
-        return dr.sum(loss) / count, dr.sum(squared) / count
+        squared, share = dr.square(self.values - target.values), self.layout.share(type(loss))
+        return dr.sum(loss) * share, dr.sum(squared) * share
 
     def gradient(self) -> Float:
         """Return d loss / d image, flat, row-major; pass 3 blurs the partials along columns."""
@@ -300,7 +301,7 @@ def _assemble_gradient(
     )
     x, y = (_Padded(layout, z, 2, 2).crop(0, 0) for z in (values, target.values))
     d_ssim = d_mu_x + 2 * x * d_mean_xx + y * d_mean_xy
-    return ((1 - weight) * _sign(x - y) - weight * d_ssim) / layout.num_values
+    return ((1 - weight) * _sign(x - y) - weight * d_ssim) * layout.share(type(x))
 
 
 def _variance(mean: Float, mean_square: Float) -> Float:
@@ -329,6 +330,10 @@ class _Layout:
     def num_values(self) -> int:
         """Values of the image, padding excluded."""
         return self.height * self.width * _CHANNELS
+
+    def share(self, float_type: type[Float]) -> Float:
+        """Return the share of a number in a mean, not compiled into kernels."""
+        return dr.opaque(float_type, 1 / self.num_values)
 
     @property
     def stride(self) -> int:

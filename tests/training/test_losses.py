@@ -7,6 +7,7 @@ import pytest
 from drjit.llvm.ad import TensorXf, TensorXf64
 from support import loss_checks
 from support.helpers import central_difference
+from support.kernels import kernel_hashes
 from support.loss_checks import images, reference, value_and_gradient
 
 from drgs.training.losses import PhotometricLoss, prepare_target
@@ -73,6 +74,14 @@ def test_gradient_equals_central_differences(height, width, weight):
 def test_law_of_the_loss_holds(check):
     """A law that broken kernels violate: see test_mutants.py."""
     check()
+
+
+def test_kernels_do_not_depend_on_the_size_of_images():
+    def hashes(height, width):
+        x, y = images(height, width)
+        return kernel_hashes(lambda: value_and_gradient(x, y, tensor_type=TensorXf))
+
+    assert hashes(21, 34) == hashes(40, 61)
 
 
 REFUSED = [
