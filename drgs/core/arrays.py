@@ -136,7 +136,10 @@ def repeat_array(values: Array, count: int, step: int = 0) -> Array:
 
 
 def existing_lanes(index_type: type[Array], count: int) -> Array:
-    """Return 0 .. count - 1, and the last number again on lanes that only fill up a vector."""
+    """Return 0 .. count - 1, and the last number again on lanes that only fill up a vector.
+
+    count: at least 1.
+    """
     return dr.minimum(dr.arange(index_type, count), dr.opaque(index_type, count - 1))
 
 

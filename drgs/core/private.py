@@ -12,7 +12,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -90,28 +90,34 @@ def same_memory(array: dr.ArrayBase) -> dr.ArrayBase:
 def shifted_views(array: Float, starts: Sequence[int], size: int) -> list[Float]:
     """Return parts of an array, ``size`` long from each start.
 
-    In the LLVM backend they are the memory of an evaluated array, loaded by whole vectors at any
-    place: ``array`` must live until they are used. Elsewhere they are gathered. Not differentiated.
+    In the LLVM backend they are its memory, which whole vectors load at any place: ``array`` is
+    evaluated, and must live until what is computed from them is evaluated. Vectors go beyond the
+    end of an array, as they do for Dr.Jit's own. Elsewhere, they are gathered. Not differentiated.
 
     Relies on ``jit_var_mem_map``, and on the device running kernels in the order of their launch.
     """
+    array = dr.detach(array)
+    dr.eval(array)
     if starts and not 0 <= min(starts) <= max(starts) <= dr.width(array) - size:
         raise IndexError(f"shifted_views(): {size} of {dr.width(array)} numbers from {starts}")
     functions = _view_functions() if dr.backend_v(array) == dr.JitBackend.LLVM else None
     if functions is None or array.state != dr.VarState.Evaluated:
         index = dr.arange(dr.uint32_array_t(type(array)), size)
-        opaque = partial(dr.opaque, type(index))
-        return [dr.gather(type(array), array, index + opaque(start)) for start in starts]
+        firsts = type(index)(list(starts))
+        places = (index + dr.gather(type(index), firsts, k) for k in range(len(starts)))
+        return [dr.gather(type(array), array, place) for place in places]
     data, mem_map, release = functions
     memory = ctypes.c_void_p()
-    held, begin = [data(array.index, ctypes.byref(memory))], cast(int, memory.value)
-    backend, number = int(dr.JitBackend.LLVM.value), dr.type_v(array)
-    item = 8 if number == dr.VarType.Float64 else 4
-    for start in starts:
-        held.append(mem_map(backend, int(number.value), begin + item * start, size, 0))
-    views = dr.detail.update_indices([type(array)(0)] * len(starts), held[1:])
-    for index in held:
-        release(index)
+    held = [data(array.index, ctypes.byref(memory))]
+    backend, number = int(dr.JitBackend.LLVM.value), int(dr.type_v(array).value)
+    try:
+        for start in starts:
+            place = cast(int, memory.value) + dr.itemsize_v(array) * start
+            held.append(mem_map(backend, number, place, size, 0))
+        views = dr.detail.update_indices([type(array)(0)] * len(starts), held[1:])
+    finally:
+        for index in held:
+            release(index)
     return cast("list[Float]", views)
 
 

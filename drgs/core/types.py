@@ -15,7 +15,6 @@ if TYPE_CHECKING:
         Array3u,
         Array4f,
         Array4u,
-        ArrayXf,
         Bool,
         Float,
         Int32,
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
         UInt64,
     )
 else:
-    Array2f = Array2u = Array3f = Array3u = Array4f = Array4u = ArrayXf = Any
+    Array2f = Array2u = Array3f = Array3u = Array4f = Array4u = Any
     Bool = Float = Int32 = Matrix3f = Matrix4f = TensorXf = UInt32 = UInt64 = Any
 
 Scalar = Float | float  # A Dr.Jit scalar or a number of the host

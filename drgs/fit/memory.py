@@ -24,9 +24,9 @@ from drgs.training.parallel.communicator import Communicator
 PROCESS_BYTES = 290_000_000  # memory of interpreter, libraries, compiled kernels, and results
 
 NUMBER_BYTES, GAUSSIAN_BYTES, GROWTH_BYTES = 28, 100, 500
-"""Memory of each number of a Gaussian: itself, its gradient, two moments, and one successor at a
-time. Memory of each Gaussian besides: its splat, and derivatives. And more where the population
-changes: rows are copied, and arrays of sizes that will not come again are held a while."""
+"""Memory of each number of a Gaussian: itself, its gradient, two moments, and successors. Memory of
+each Gaussian besides: its splat, and derivatives. And more where the population changes: rows are
+copied, and arrays of sizes that will not come again are held a while."""
 
 ENTRY_BYTES, SLOT_BYTES = 150, 36
 """Memory of each (splat, tile) entry; of each composited (entry, micro-tile) pair of a band."""

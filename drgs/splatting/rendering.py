@@ -323,12 +323,12 @@ def weighted_sums(frame: Frame, *planes: Float) -> list[Float]:
     features = bins.model.features.with_weight_derivatives()
     tiles = replace(frame.tiles, bins=replace(bins, model=replace(bins.model, features=features)))
     repeated = [repeat_array(plane, samples) for plane in planes]
-    # Not one array several times: Dr.Jit would compile another kernel.
-    first, *others = (
+    # Separate arrays of zeros: for one array several times, Dr.Jit would compile another kernel.
+    of_transmittance, *of_other_planes = (
         dr.opaque(type(repeated[0]), 0, dr.width(repeated[0]))
         for _ in range(1 + tiles.count - len(planes))
     )
-    d_planes = [first, *repeated, *others]
+    d_planes = [of_transmittance, *repeated, *of_other_planes]
     gradients = frame.order.adjoint(tiles, d_planes, range(samples))
     return gradients.features[: len(planes)]
 

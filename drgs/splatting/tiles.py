@@ -120,6 +120,7 @@ def bin_splats(table: SplatTable, grid: TileGrid, model: ImageModel) -> TileBins
     splat = dr.arange(t.UInt32, num_splats + 1)
     counts = t.UInt32(boxes.load(splat, splat < dr.opaque(t.UInt32, num_splats))[-1])
     first_entry = dr.prefix_sum(counts)
+    del counts
     num_entries = int(first_entry[num_splats])  # before sorting, which waits for the device, too
     # A stable sort: equal depths stay in the order of the Gaussians.
     order = t.UInt32(dr.argsort(depths))

@@ -59,12 +59,17 @@ def test_contiguous_rows_are_loaded_and_stored(precision, width, num_rows):
 def test_shifted_views_are_parts_of_an_array(precision, is_evaluated, monkeypatch):
     """They share its memory, or are gathered where Dr.Jit has no such functions."""
     expected = np.arange(80) * 2.0
+    assert private._view_functions() is not None
     for functions in (private._view_functions, lambda: None):
         monkeypatch.setattr(private, "_view_functions", functions)
         array = dr.arange(precision.Float, 80) * 2
         if is_evaluated:
             dr.eval(array)
         views = private.shifted_views(array, [0, 3, 17], 63)
+        begin, second = (each.numpy().ctypes.data for each in (array, views[1]))
+        assert (second == begin + 3 * dr.itemsize_v(array)) == (
+            private._view_functions() is not None
+        )
         for start, view in zip((0, 3, 17), views, strict=True):
             np.testing.assert_array_equal(np.array(view + 1), expected[start:][:63] + 1)
         literal = private.shifted_views(dr.full(precision.Float, 3, 9), [2], 7)
