@@ -300,6 +300,7 @@ LOSSES = {
     "squared error of L1": partial(
         loss_checks.check_squared_error_is_the_mean_over_pixels_and_channels, 0
     ),
+    "loss of black": loss_checks.check_black_photographs_count_like_others,
     "loss overexposed": loss_checks.check_overexposed_images_do_not_blow_up_the_gradient,
 }
 

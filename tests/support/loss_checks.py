@@ -72,6 +72,13 @@ def check_squared_error_is_the_mean_over_pixels_and_channels(weight):
     assert error[0] == pytest.approx(np.mean((x - y) ** 2), rel=1e-12)
 
 
+def check_black_photographs_count_like_others():
+    x, _ = images(13, 9)
+    y = np.zeros_like(x)
+    loss, _ = value_and_gradient(x, y, 0.2)
+    assert loss == pytest.approx(reference(x, y, 0.2), rel=1e-12)
+
+
 def check_l1_gradient_is_the_sign_and_zero_at_equality():
     x, y = images(7, 11, levels=3)
     assert (x == y).any()

@@ -68,6 +68,7 @@ def test_gradient_equals_central_differences(height, width, weight):
     "check",
     [
         loss_checks.check_gradient_is_the_transpose_of_the_tangent,
+        loss_checks.check_black_photographs_count_like_others,
         loss_checks.check_l1_gradient_is_the_sign_and_zero_at_equality,
         loss_checks.check_overexposed_images_do_not_blow_up_the_gradient,
         partial(loss_checks.check_squared_error_is_the_mean_over_pixels_and_channels, 0),
