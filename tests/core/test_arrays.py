@@ -67,9 +67,8 @@ def test_shifted_views_are_parts_of_an_array(precision, is_evaluated, monkeypatc
             dr.eval(array)
         views = private.shifted_views(array, [0, 3, 17], 63)
         begin, second = (each.numpy().ctypes.data for each in (array, views[1]))
-        assert (second == begin + 3 * dr.itemsize_v(array)) == (
-            private._view_functions() is not None
-        )
+        is_same_memory = second == begin + 3 * dr.itemsize_v(array)
+        assert is_same_memory == (private._view_functions() is not None)
         for start, view in zip((0, 3, 17), views, strict=True):
             np.testing.assert_array_equal(np.array(view + 1), expected[start:][:63] + 1)
         literal = private.shifted_views(dr.full(precision.Float, 3, 9), [2], 7)
